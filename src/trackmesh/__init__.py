@@ -1,0 +1,1 @@
+"""trackmesh: an open track server over Zenoh."""

@@ -1,0 +1,114 @@
+"""The bus: publish, subscribe, query, serve, alive.
+
+Everything above the network is written against ``Bus``. ``MemoryBus`` here joins parts of one process, for tests and
+offline use; ``zenoh_bus.ZenohBus`` joins hosts. Payloads are bytes, the codec is the caller's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple, Protocol, Self
+
+
+class Sample(NamedTuple):
+    """One message as it came."""
+
+    key: str
+    payload: bytes
+    encoding: str
+
+
+class AliveEvent(NamedTuple):
+    """A liveliness token that appeared or went."""
+
+    key: str
+    alive: bool
+
+
+class Query(NamedTuple):
+    """A question as it came to a server."""
+
+    key: str
+    parameters: dict[str, str]
+    payload: bytes
+    encoding: str
+
+
+QueryHandler = Callable[[Query], Iterable[tuple[bytes, str]]]
+"""Answers a query: yields (payload, encoding) of each reply as it is ready. It runs in a worker thread."""
+
+
+class Closeable(Protocol):
+    """Something declared on the bus that can be taken back."""
+
+    def close(self) -> None:
+        """Take it back; twice is once."""
+
+
+class Publisher(Closeable, Protocol):
+    """A declared publisher of one key."""
+
+    def put(self, payload: bytes, encoding: str) -> None:
+        """Publish one message. Never blocks on a slow or absent network."""
+
+
+class Subscription(Closeable, Protocol):
+    """Messages of a key expression, oldest first, in a bounded buffer that drops the oldest."""
+
+    def receive(self, timeout_s: float | None = None) -> Sample | None:
+        """The next message, or None when the time is over or the subscription is closed."""
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Messages until the subscription is closed."""
+
+
+class AliveSubscription(Closeable, Protocol):
+    """Comings and goings of liveliness tokens, starting with those already there."""
+
+    def receive(self, timeout_s: float | None = None) -> AliveEvent | None:
+        """The next event, or None when the time is over or the subscription is closed."""
+
+
+class Bus(Protocol):
+    """What every part of trackmesh needs of a network."""
+
+    def publisher(self, key: str, *, history: int = 0) -> Publisher:
+        """Declare a publisher.
+
+        Args:
+            key: a whole key.
+            history: how many messages are kept for late joiners and to fill the gaps of an outage; 0 for none.
+        """
+
+    def subscribe(self, expression: str, *, history: bool = False, capacity: int = 256) -> Subscription:
+        """Subscribe to a key expression; with ``history`` also to what publishers kept, gaps filled in order."""
+
+    def query(
+        self,
+        expression: str,
+        payload: bytes = b"",
+        encoding: str = "",
+        *,
+        parameters: str = "",
+        timeout_s: float = 2.0,
+    ) -> Iterator[Sample]:
+        """Ask, and iterate over the replies as they come; ends when all servers are done or the time is over."""
+
+    def serve(self, key: str, handler: QueryHandler, *, workers: int = 2) -> Closeable:
+        """Answer queries to a key, ``workers`` at a time."""
+
+    def declare_alive(self, key: str) -> Closeable:
+        """Declare a liveliness token."""
+
+    def alive(self, expression: str, *, timeout_s: float = 1.0) -> list[str]:
+        """Keys of the tokens present now, sorted."""
+
+    def watch_alive(self, expression: str) -> AliveSubscription:
+        """Follow liveliness tokens."""
+
+    def close(self) -> None:
+        """Take back all declarations and leave, under a deadline; twice is once."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *exc: object) -> None: ...

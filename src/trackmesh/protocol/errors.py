@@ -1,0 +1,50 @@
+"""The errors of the protocol, one tree.
+
+TrackmeshError
+├── RefusedMessage      a message from outside that is wrong: reason (a counter's name) and one sentence
+├── BusError            the network cannot be reached or used
+│   └── Unavailable     nobody answers a query
+└── QueryFailed         a service answered a query with an error: code and one sentence
+"""
+
+from __future__ import annotations
+
+
+class TrackmeshError(Exception):
+    """Every error of trackmesh that a user may meet; ``str()`` is one clear sentence."""
+
+
+class RefusedMessage(TrackmeshError, ValueError):
+    """A message that is refused whole.
+
+    Attributes:
+        reason: short machine-readable reason, used as the name of a counter (``"not_finite"``).
+        detail: one sentence for people.
+    """
+
+    def __init__(self, reason: str, detail: str) -> None:
+        super().__init__(f"{detail} [{reason}]")
+        self.reason = reason
+        self.detail = detail
+
+
+class BusError(TrackmeshError):
+    """The bus cannot be reached or used."""
+
+
+class Unavailable(BusError):
+    """No service answered a query."""
+
+
+class QueryFailed(TrackmeshError):
+    """A service answered a query with an error.
+
+    Attributes:
+        code: short machine-readable code (``"too_large"``).
+        detail: one sentence for people.
+    """
+
+    def __init__(self, code: str, detail: str) -> None:
+        super().__init__(f"{detail} [{code}]")
+        self.code = code
+        self.detail = detail

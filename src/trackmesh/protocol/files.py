@@ -1,0 +1,137 @@
+"""The JSON-lines files: one object a line, ``"type"`` first, then the fields of the message.
+
+``PLOTS.jsonl`` holds ``unit``, ``origin``, ``sensor``, ``plots`` and ``tick`` in order of arrival; ``TRACKS.jsonl``
+holds ``tracks``; ``TRUTH.jsonl`` holds ``truth``; ``SCANS.jsonl`` holds ``emi_scan``; results of an inversion are
+``emi_result``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TextIO
+
+from trackmesh.protocol.codec import from_object
+from trackmesh.protocol.errors import RefusedMessage, TrackmeshError
+from trackmesh.protocol.messages import (
+    EmiResult,
+    EmiScanBatch,
+    Geodetic,
+    Message,
+    PlotBatch,
+    SensorInfo,
+    TrackFrame,
+    TruthFrame,
+)
+from trackmesh.protocol.messages.base import BootId, Id, UnixNs
+
+
+class Tick(Message):
+    """Time passed without data (a line of a black box)."""
+
+    t_ns: UnixNs
+
+
+class UnitRecord(Message):
+    """Who recorded a black box, and with which settings: what is needed to give the same frames again."""
+
+    unit_id: Id
+    unit_number: int
+    boot_id: BootId
+    first_track_number: int
+    settings: dict[str, Any]
+
+
+Record = Message
+RECORD_TYPES: dict[str, type[Message]] = {
+    "unit": UnitRecord,
+    "origin": Geodetic,
+    "sensor": SensorInfo,
+    "plots": PlotBatch,
+    "tick": Tick,
+    "tracks": TrackFrame,
+    "truth": TruthFrame,
+    "emi_scan": EmiScanBatch,
+    "emi_result": EmiResult,
+}
+_NAMES = {kind: name for name, kind in RECORD_TYPES.items()}
+
+
+def to_line(record: Message) -> str:
+    """One line of a file, without its newline."""
+    body = record.model_dump_json()
+    return f'{{"type":"{_NAMES[type(record)]}",{body[1:]}'
+
+
+def from_line(line: str) -> Message:
+    """The record of one line.
+
+    Raises:
+        RefusedMessage: the line is no record.
+    """
+    try:
+        fields = json.loads(line)
+    except ValueError as error:
+        raise RefusedMessage("malformed", f"No JSON: {error}.") from None
+    if not isinstance(fields, dict):
+        raise RefusedMessage("malformed", "A line must be a JSON object.")
+    name = fields.pop("type", None)
+    kind = RECORD_TYPES.get(name) if isinstance(name, str) else None
+    if kind is None:
+        raise RefusedMessage("wrong_schema", f"Unknown type {name!r}, expected one of {', '.join(RECORD_TYPES)}.")
+    return from_object(fields, kind)
+
+
+def read_records(path: Path, *wanted: type[Message]) -> Iterator[Message]:
+    """The records of a file in order; ``wanted`` kinds only, where given (others are then an error).
+
+    Raises:
+        TrackmeshError: the file cannot be read, or a line is wrong; the sentence names file and line.
+    """
+    try:
+        with path.open(encoding="utf-8") as file:
+            for number, line in enumerate(file, 1):
+                if line.strip():
+                    yield _record(path, number, line, wanted)
+    except OSError as error:
+        raise TrackmeshError(f"Cannot read {path}: {error.strerror}.") from None
+    except UnicodeDecodeError:
+        raise TrackmeshError(f"{path} is not a text file.") from None
+
+
+def _record(path: Path, number: int, line: str, wanted: tuple[type[Message], ...]) -> Message:
+    try:
+        record = from_line(line)
+    except RefusedMessage as error:
+        raise TrackmeshError(f"{path}, line {number}: {error}") from None
+    if wanted and not isinstance(record, wanted):
+        kinds = " or ".join(_NAMES[k] for k in wanted)
+        raise TrackmeshError(f"{path}, line {number}: a line of type {kinds} is expected, not {_NAMES[type(record)]}.")
+    return record
+
+
+class RecordWriter:
+    """Writes records to a file, a line each, flushed at every line so that a killed process loses none."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self._file: TextIO = path.open("w", encoding="utf-8")
+        except OSError as error:
+            raise TrackmeshError(f"Cannot write {path}: {error.strerror}.") from None
+
+    def write(self, record: Message) -> None:
+        """Append one record."""
+        self._file.write(to_line(record) + "\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()

@@ -1,0 +1,106 @@
+"""What all messages share: strictness, the schema id, equal lengths of axes with one name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from trackmesh.protocol.arrays import ArrayField, Axis
+
+ID_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
+ID_RE = re.compile(ID_PATTERN)
+
+Id = Annotated[str, Field(pattern=ID_PATTERN)]
+"""Name of a sensor, unit or realm: one chunk of a key."""
+
+BootId = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+"""Drawn anew at each start of a process: tells a restart from a gap."""
+
+UnixNs = Annotated[int, Field(ge=0, le=2**63 - 1)]
+"""UTC nanoseconds since 1970-01-01."""
+
+Seq = Annotated[int, Field(ge=0, le=2**63 - 1)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Probability = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+def _named_axes(cls: type[BaseModel]) -> Iterator[tuple[str, tuple[int | str | None, ...]]]:
+    for name, info in cls.model_fields.items():
+        for mark in _metadata(info.metadata, info.annotation):
+            if isinstance(mark, ArrayField):
+                yield name, mark.shape
+            elif isinstance(mark, Axis):
+                yield name, (mark.name,)
+
+
+def _metadata(metadata: list[Any], annotation: Any) -> list[Any]:
+    # Optional fields (X | None) hide their metadata one level deeper.
+    found = list(metadata)
+    for arg in getattr(annotation, "__args__", ()):
+        found += getattr(arg, "__metadata__", ())
+    return found
+
+
+class Message(BaseModel):
+    """Base of every message: frozen, no unknown fields, axes of one name equally long."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+
+    _axes: ClassVar[tuple[tuple[str, tuple[int | str | None, ...]], ...]] = ()
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        cls._axes = tuple(_named_axes(cls))
+
+    @model_validator(mode="after")
+    def _equal_axes(self) -> Self:
+        length: dict[str, int] = {}
+        for field, axes in self._axes:
+            value = getattr(self, field)
+            if value is None:
+                continue
+            shape = value.shape if isinstance(value, np.ndarray) else (len(value),)
+            for axis, got in zip(axes, shape, strict=True):
+                if isinstance(axis, str) and length.setdefault(axis, got) != got and not _empty(value):
+                    raise PydanticCustomError(
+                        "wrong_length",
+                        "{field} has {got} along its axis {axis}, where {want} are needed",
+                        {"field": field, "axis": axis, "got": got, "want": length[axis]},
+                    )
+        return self
+
+    def __eq__(self, other: object) -> bool:
+        if type(self) is not type(other):
+            return NotImplemented
+        return all(_equal(getattr(self, f), getattr(other, f)) for f in type(self).model_fields)
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+class TopMessage(Message):
+    """A message that travels by itself: it has a schema id and a version."""
+
+    schema_version: Annotated[int, Field(ge=1, le=1)] = 1
+
+    @classmethod
+    def schema_id(cls) -> str:
+        """The schema's name as it stands in the encoding: ``trackmesh.PlotBatch.v1``."""
+        return f"trackmesh.{cls.__name__}.v1"
+
+
+def _empty(value: Any) -> bool:
+    # An empty (0, c) array came from JSON as []: its other axes are unknown, not wrong.
+    return isinstance(value, np.ndarray) and value.size == 0 and value.shape[0] == 0 and value.ndim > 1
+
+
+def _equal(a: Any, b: Any) -> bool:
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and np.array_equal(a, b)
+    return bool(a == b)

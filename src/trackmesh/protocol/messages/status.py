@@ -1,0 +1,47 @@
+"""How a service is: counters by reason, latencies, the health of its sensors."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from trackmesh.protocol.messages.base import BootId, Finite, Id, Message, NonNegative, Seq, TopMessage, UnixNs
+
+Count = Annotated[int, Field(ge=0)]
+
+
+class SensorHealth(Message):
+    """One sensor as a fusion unit sees it."""
+
+    sensor_id: Id
+    alive: bool
+    plots: Count
+    batches: Count
+    gaps: Count
+    duplicates: Count
+    refused: Count
+    last_seq: Seq | None = None
+    last_t_ns: UnixNs | None = None
+    clutter_density: NonNegative | None = None
+
+
+class ServiceStatus(TopMessage):
+    """One service's health, once a second.
+
+    ``counters`` count since start, ``refused`` counts refused input by reason, ``latency_ms`` holds percentiles
+    (``"p50"``, ``"p90"``, ``"p99"``) of the last minute, ``figures`` other present values by name.
+    """
+
+    kind: Id
+    unit_id: Id
+    boot_id: BootId
+    seq: Seq
+    t_ns: UnixNs
+    state: Literal["starting", "compiling", "ready", "stopping"]
+    uptime_s: NonNegative
+    counters: dict[str, Count] = {}
+    refused: dict[str, Count] = {}
+    latency_ms: dict[str, NonNegative] = {}
+    figures: dict[str, Finite] = {}
+    sensors: list[SensorHealth] = []

@@ -1,0 +1,131 @@
+"""The picture: frames of tracks, questions about it, what neighbouring units tell each other."""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from trackmesh.protocol.arrays import (
+    ArrayField,
+    Axis,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    UInt8Array,
+    UInt32Array,
+)
+from trackmesh.protocol.messages.base import BootId, Finite, Id, Message, NonNegative, Seq, TopMessage, UnixNs
+from trackmesh.protocol.messages.plots import Geodetic
+
+TENTATIVE, CONFIRMED, COASTING, ENDED = 0, 1, 2, 3
+"""Values of ``TrackFrame.status``."""
+
+_UPPER = np.triu_indices(6)
+
+
+class TrackFrame(TopMessage):
+    """One atomic picture: the tracks that a unit owns, predicted to ``t_ns``.
+
+    ``state`` is [east_m, north_m, veast, vnorth, aeast, anorth] in the system plane; a filter without acceleration pads
+    it, and its covariance, with zeros. ``covariance`` is the upper triangle of the 6x6 matrix, row by row;
+    ``covariance_matrices()`` gives it whole. ``status`` is 0 tentative, 1 confirmed, 2 coasting, 3 ended. ``members``
+    holds, per sensor of ``sensors``, the id of the local track that took the same plots, or -1. A track missing from
+    a frame has not ended: only status 3, or silence, ends it.
+    """
+
+    unit_id: Id
+    boot_id: BootId
+    seq: Seq
+    t_ns: UnixNs
+    origin: Geodetic | None = None
+    track_id: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0, le=2**53)]
+    epoch: Annotated[UInt32Array, ArrayField("<u4", ("n",))]
+    status: Annotated[UInt8Array, ArrayField("|u1", ("n",), le=3)]
+    state: Annotated[FloatArray, ArrayField("<f8", ("n", 6))]
+    covariance: Annotated[Float32Array, ArrayField("<f4", ("n", 21))]
+    height_m: Annotated[FloatArray, ArrayField("<f8", ("n",))] | None = None
+    height_variance_m2: Annotated[FloatArray, ArrayField("<f8", ("n",), ge=0)] | None = None
+    model_probability: Annotated[FloatArray, ArrayField("<f8", ("n", "r"), ge=0, le=1)]
+    models: Annotated[list[str], Axis("r")]
+    sensors: Annotated[list[Id], Axis("s")]
+    members: Annotated[IntArray, ArrayField("<i8", ("n", "s"), ge=-1)]
+    updated_t_ns: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0)]
+    first_t_ns: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0)]
+
+    def covariance_matrices(self) -> FloatArray:
+        """Covariances as full symmetric matrices, shape (n, 6, 6)."""
+        full = np.zeros((len(self.track_id), 6, 6))
+        full[:, _UPPER[0], _UPPER[1]] = self.covariance
+        full[:, _UPPER[1], _UPPER[0]] = self.covariance
+        return full
+
+
+class TrackQuery(TopMessage):
+    """Which tracks are wanted; every condition given must hold, none given means all confirmed and coasting tracks.
+
+    ``bbox_enu_m`` is [east, north, east, north] of the south-west and north-east corners, ``bbox_deg`` [latitude,
+    longitude, latitude, longitude] of the same; ``at_t_ns`` predicts the picture to that time, ``max_age_s`` leaves out
+    tracks whose last plot is older.
+    """
+
+    track_ids: Annotated[list[int], Field(max_length=100_000)] | None = None
+    bbox_enu_m: Annotated[list[Finite], Field(min_length=4, max_length=4)] | None = None
+    bbox_deg: Annotated[list[Finite], Field(min_length=4, max_length=4)] | None = None
+    status: Annotated[list[Annotated[int, Field(ge=0, le=3)]], Field(max_length=4)] | None = None
+    max_age_s: NonNegative | None = None
+    at_t_ns: UnixNs | None = None
+
+
+class HistoryQuery(TrackQuery):
+    """Which past tracks are wanted: a ``TrackQuery`` over a span of time."""
+
+    from_t_ns: UnixNs
+    to_t_ns: UnixNs
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.to_t_ns < self.from_t_ns:
+            raise PydanticCustomError("invalid", "to_t_ns must not be before from_t_ns")
+        return self
+
+
+class BandFrame(TopMessage):
+    """What a unit tells its neighbours: its confirmed tracks near the border, with their last plots' keys."""
+
+    unit_id: Id
+    boot_id: BootId
+    seq: Seq
+    t_ns: UnixNs
+    track_id: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0, le=2**53)]
+    owner: Annotated[UInt8Array, ArrayField("|u1", ("n",), le=1)]
+    epoch: Annotated[UInt32Array, ArrayField("<u4", ("n",))]
+    first_t_ns: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0)]
+    updated_t_ns: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0)]
+    plot_keys: Annotated[IntArray, ArrayField("<i8", ("n", 6))]
+    state: Annotated[Float32Array, ArrayField("<f4", ("n", 4))]
+    covariance: Annotated[Float32Array, ArrayField("<f4", ("n", 10))]
+
+
+class SensorBias(Message):
+    """One sensor's estimated bias: [range_m, azimuth_rad] of a radar, [east_m, north_m] of a position sensor."""
+
+    sensor_id: Id
+    columns: Annotated[list[str], Field(min_length=2, max_length=2)]
+    bias: Annotated[FloatArray, ArrayField("<f8", (2,))]
+    covariance: Annotated[FloatArray, ArrayField("<f8", (2, 2))]
+    locked: bool
+    pairs: Annotated[int, Field(ge=0)]
+    jumps: Annotated[int, Field(ge=0)]
+
+
+class Registration(TopMessage):
+    """A unit's present estimate of the biases of its sensors."""
+
+    unit_id: Id
+    boot_id: BootId
+    seq: Seq
+    t_ns: UnixNs
+    sensors: list[SensorBias]
