@@ -1,0 +1,1 @@
+"""Plots to fused tracks: local tracks of each sensor, system tracks of all, and the test that joins them."""

@@ -1,0 +1,349 @@
+"""The fusion engine: plots in, pictures out. Pure: no network, no clock; the same inputs give the same frames.
+
+The way of a batch: the local layer of its sensor (raw plots, knows nothing of the others), the system layer (the plots
+of all sensors; it makes the picture), the count of shared plots, and every ``cycle_s`` the association cycle. Time
+comes with the data, and as ticks when no data comes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from trackmesh.protocol.errors import RefusedMessage
+from trackmesh.protocol.messages import ENDED, Geodetic, PlotBatch, SensorInfo, TrackFrame, TrackQuery
+from trackmesh.services.estimation import tracks
+from trackmesh.services.estimation.lookup import index_of
+from trackmesh.services.estimation.pairs import PairRules, state_distances
+from trackmesh.services.fusion import frames, life, membership
+from trackmesh.services.fusion.association import NUMBER_MASK, DeclaredPairs, LocalTracks, SequentialTest
+from trackmesh.services.fusion.layer import Layer, Look, Plots
+from trackmesh.services.fusion.life import Rules
+from trackmesh.services.fusion.sensors import Sensor
+from trackmesh.services.fusion.settings import EngineSettings
+
+IntArray = npt.NDArray[np.int64]
+
+_COASTING_AFTER_PERIODS = 1.5
+_TENTATIVE_AGE_PERIODS = 2.2
+_SEEN_LATELY_PERIODS = 5.0
+_JUDGED_SECTORS_LATE = 1.5
+_MERGE_GATE = 25.0
+_HITS_FOR_TEST = 3
+_TRACK_BITS = 41
+
+
+class Unit(NamedTuple):
+    """Who the engine is: its names in frames and the numbers it gives to tracks.
+
+    Track ids are ``number << 41 | n`` with n counting up from ``first_track``, so that they are unique over units and
+    restarts.
+    """
+
+    unit_id: str = "main"
+    number: int = 0
+    boot_id: str = "offline"
+    first_track: int = 0
+
+
+class FusionEngine:
+    """One unit's tracker.
+
+    Attributes:
+        counters: what happened, by name (``plots``, ``late_plots``, ``merged``, ``contradictions``, ...).
+        sensors: by id, in the order in which they were first heard of.
+    """
+
+    def __init__(self, settings: EngineSettings, unit: Unit, origin: Geodetic | None = None) -> None:
+        self.settings = settings
+        self.unit = unit
+        self.origin = origin
+        self.counters: Counter[str] = Counter()
+        self.sensors: dict[str, Sensor] = {}
+        self._models = settings.models()
+        self._system = self._layer(self._rules(1.0, settings.coast_s), settings.ring_system, 1)
+        self._locals: list[Layer] = []
+        self._tests: dict[tuple[int, int], SequentialTest] = {}
+        self._pair_rules = PairRules(speed_mps=settings.pair_speed_mps, radius_m=settings.pair_radius_m)
+        self._pairs_declared = 0
+        self._next_track = unit.first_track
+        self._seq = 0
+        self._epoch_ns: int | None = None
+        self._now_s = 0.0
+        self._cycle_s = -np.inf
+        self._frame_s = -np.inf
+        self._ended: list[TrackFrame] = []
+
+    @property
+    def now_ns(self) -> int | None:
+        """The engine's time: the newest that data or ticks have told; None before any."""
+        return None if self._epoch_ns is None else self._to_ns(self._now_s)
+
+    def sensor(self, info: SensorInfo) -> None:
+        """Take note of a sensor; a known one is replaced, its tracks live on."""
+        old = self.sensors.get(info.sensor_id)
+        if old is not None and old.info == info:
+            return
+        if self.origin is None and info.site is not None:
+            self.origin = info.site
+        sensor = Sensor(old.index if old else len(self.sensors), info, self.origin)
+        self.sensors[info.sensor_id] = sensor
+        longest = max(s.info.period_s for s in self.sensors.values())
+        self._system.rules = self._rules(longest, self.settings.coast_s)
+        rules = self._rules(info.period_s, self.settings.local_coast_periods * info.period_s)
+        if old is None:
+            self._system.add_sensors(len(self.sensors))
+            self._locals.append(self._layer(rules, self.settings.ring_local, 1))
+            for other in range(sensor.index):
+                self._tests[other, sensor.index] = SequentialTest(self._pair_rules)
+        else:
+            self._locals[sensor.index].rules = rules
+
+    def plots(self, batch: PlotBatch) -> TrackFrame | None:
+        """Take a batch of plots; the new picture, unless the last one is too recent.
+
+        Raises:
+            RefusedMessage: the sensor is unknown, or its plots cannot be placed.
+        """
+        sensor = self.sensors.get(batch.sensor_id)
+        if sensor is None:
+            raise RefusedMessage("unknown_sensor", f"Nothing is known of sensor {batch.sensor_id} yet.")
+        z, R = sensor.plane(batch)
+        if len(z):
+            self._take(sensor, batch, z, R)
+        return self._due_frame(self.settings.frame_period_s)
+
+    def tick(self, t_ns: int) -> TrackFrame | None:
+        """Let time advance without data; a picture now and then."""
+        self._advance(self._to_s(t_ns))
+        self._note_ended(self._system.judge(self._now_s)[1])
+        for local in self._locals:
+            local.judge(self._now_s)
+        self._cycle_if_due()
+        return self._due_frame(max(self.settings.idle_frame_s, self.settings.frame_period_s))
+
+    def query(self, query: TrackQuery) -> TrackFrame:
+        """The present picture, or that at ``query.at_t_ns``, as far as it is asked for; changes nothing.
+
+        Raises:
+            RefusedMessage: the query cannot be answered (no origin for a geographic box).
+        """
+        tentative = query.status is not None and 0 in query.status
+        t_s = self._now_s
+        if query.at_t_ns is not None and self._epoch_ns is not None:
+            t_s = (query.at_t_ns - self._epoch_ns) / 1e9
+        return frames.select(self._picture(t_s, tentative), query)
+
+    def figures(self) -> dict[str, float]:
+        """Present values for the status: tracks, local tracks, pairs under the sequential test."""
+        rows = self._system.rows
+        confirmed = int(self._system.life.confirmed[rows].sum())
+        out = {"tracks": confirmed, "tentative": len(rows) - confirmed, "pairs": self._pairs_declared}
+        out |= {f"local_tracks.{s.info.sensor_id}": len(self._locals[s.index].rows) for s in self.sensors.values()}
+        return {name: float(value) for name, value in out.items()}
+
+    # --- one batch ---
+
+    def _take(self, sensor: Sensor, batch: PlotBatch, z: npt.NDArray[np.float64], R: npt.NDArray[np.float64]) -> None:
+        t_s = self._to_s_array(batch.t_ns)
+        self._advance(float(t_s.max()))
+        fresh = t_s >= self._now_s - self.settings.max_lateness_s
+        self.counters["plots"] += len(t_s)
+        self.counters["too_late_plots"] += int(len(t_s) - fresh.sum())
+        if not fresh.any():
+            return
+        plots = Plots(np.ascontiguousarray(z[fresh]), np.ascontiguousarray(R[fresh]), t_s[fresh])
+        sectors = batch.scan.sectors if batch.scan else 1
+        n, share = len(plots.t_s), 1.0 / sectors
+        local = self._locals[sensor.index]
+        density = sensor.local_clutter.value(n, share)
+        got = local.step(plots, self._look(sensor, 0, plots, sectors, density), self._now_s)
+        sensor.local_clutter.add(n - int(got.by_confirmed.sum()), share)
+        density = sensor.system_clutter.value(n, share)
+        fed = self._system.step(plots, self._look(sensor, sensor.index, plots, sectors, density), self._now_s)
+        sensor.system_clutter.add(n - int(fed.by_confirmed.sum()), share)
+        self.counters["late_plots"] += fed.late
+        life.share(local.life, got.row, self._system.life.uid[fed.row])
+        self._name(fed.confirmed)
+        self._note_ended(fed.ended)
+        self._cycle_if_due()
+
+    def _look(self, sensor: Sensor, index: int, plots: Plots, sectors: int, density: float) -> Look:
+        info = sensor.info
+        return Look(
+            sensor=index,
+            t_s=float(plots.t_s.max()),
+            site=sensor.site,
+            max_range_m=info.max_range_m,
+            period_s=info.period_s,
+            p_detect=info.p_detect,
+            whole=sectors == 1,
+            margin_s=_JUDGED_SECTORS_LATE * info.period_s / sectors,
+            lately_s=np.inf if info.kind == "radar" else _SEEN_LATELY_PERIODS * info.period_s,
+            clutter_density=density,
+        )
+
+    def _name(self, rows: IntArray) -> None:
+        """Give newly confirmed system tracks their public numbers."""
+        count = len(rows)
+        self._system.life.link[rows] = (self.unit.number << _TRACK_BITS) | (self._next_track + np.arange(count))
+        self._next_track += count
+        self.counters["confirmed"] += count
+
+    # --- the association cycle ---
+
+    def _cycle_if_due(self) -> None:
+        if self._now_s - self._cycle_s < self.settings.cycle_s:
+            return
+        self._cycle_s = self._now_s
+        for sensor, local in enumerate(self._locals):
+            membership.renew(self._system, local, sensor)
+        seen = [self._local_tracks(local) for local in self._locals]
+        self._pairs_declared = 0
+        for (a, b), test in self._tests.items():
+            pairs = test.cycle(seen[a], seen[b], self._now_s)
+            self._pairs_declared += len(pairs.a)
+            self._join(a, b, seen[a].number[pairs.a], seen[b].number[pairs.b], pairs)
+
+    def _local_tracks(self, local: Layer) -> LocalTracks:
+        rows = local.rows
+        rows = rows[local.life.hits[rows] >= _HITS_FOR_TEST]
+        x, P, _ = local.predict(rows, np.maximum(local.filters.t_s[rows], self._now_s))
+        return LocalTracks(local.life.uid[rows] & NUMBER_MASK, x, P)
+
+    def _join(self, a: int, b: int, number_a: IntArray, number_b: IntArray, pairs: DeclaredPairs) -> None:
+        """Merge system tracks that a declared pair says are one, unless their plots contradict it."""
+        rows = self._system.rows
+        rows = rows[self._system.life.confirmed[rows]]
+        member = self._system.life.member
+        row_a = self._member_rows(rows, member[rows, a], number_a)
+        row_b = self._member_rows(rows, member[rows, b], number_b)
+        apart = (row_a >= 0) & (row_b >= 0) & (row_a != row_b)
+        for one, other in zip(row_a[apart].tolist(), row_b[apart].tolist(), strict=True):
+            self._merge(one, other)
+
+    @staticmethod
+    def _member_rows(rows: IntArray, members: IntArray, numbers: IntArray) -> IntArray:
+        held = members >= 0
+        place = index_of(members[held] & NUMBER_MASK, numbers)
+        return np.where(place >= 0, rows[held][place] if held.any() else -1, -1)
+
+    def _merge(self, one: int, other: int) -> None:
+        known = self._system.life
+        if not (known.alive[one] and known.alive[other]):
+            return
+        pair = np.array([one, other])
+        x, P, _ = self._system.predict(pair, np.maximum(self._system.filters.t_s[pair], self._now_s))
+        zero, first = np.zeros(1, np.int64), np.ones(1, np.int64)
+        distance, _ = state_distances(x, P, x, P, zero, first)
+        both = ((known.member[one] >= 0) & (known.member[other] >= 0)).any()
+        if both or distance[0] > _MERGE_GATE:
+            self.counters["contradictions"] += 1
+            return
+        old, young = sorted((one, other), key=lambda row: int(known.link[row]))
+        tracks.feed_ring(self._models, self._system.filters, young, old)
+        free = known.member[old] < 0
+        known.member[old][free] = known.member[young][free]
+        known.last_s[old] = max(known.last_s[old], known.last_s[young])
+        self._note_ended([(young, int(known.uid[young]), int(known.link[young]))])
+        self._system.drop(young)
+        self.counters["merged"] += 1
+
+    # --- the picture ---
+
+    def _due_frame(self, period_s: float) -> TrackFrame | None:
+        if self._epoch_ns is None or self._now_s - self._frame_s < period_s:
+            return None
+        self._frame_s = self._now_s
+        frame = self._picture(self._now_s, self.settings.publish_tentative, self._seq, self._take_ended())
+        self._seq += 1
+        return frame
+
+    def _picture(
+        self, t_s: float, tentative: bool, seq: int | None = None, ended: list[TrackFrame] | None = None
+    ) -> TrackFrame:
+        rows = self._system.rows
+        if not tentative:
+            rows = rows[self._system.life.confirmed[rows]]
+        rows = rows[self._system.filters.lag_t_s[rows] <= t_s]
+        frame = self._frame_of(rows, t_s, self._seq if seq is None else seq)
+        return frames.join(frame, ended) if ended else frame
+
+    def _frame_of(self, rows: IntArray, t_s: float, seq: int) -> TrackFrame:
+        known = self._system.life
+        x, P, mu = self._system.predict(rows, t_s)
+        state, covariance = frames.pack_states(x, P)
+        longest = max((s.info.period_s for s in self.sensors.values()), default=1.0)
+        return TrackFrame.model_construct(
+            schema_version=1,
+            unit_id=self.unit.unit_id,
+            boot_id=self.unit.boot_id,
+            seq=seq,
+            t_ns=self._to_ns(t_s) if self._epoch_ns is not None else 0,
+            origin=self.origin,
+            track_id=np.where(known.confirmed[rows], known.link[rows], self._tentative_id(rows)),
+            epoch=np.zeros(len(rows), "<u4"),
+            status=frames.status_of(self._system, rows, t_s, _COASTING_AFTER_PERIODS * longest),
+            state=state,
+            covariance=covariance,
+            height_m=None,
+            height_variance_m2=None,
+            model_probability=mu,
+            models=self.settings.model_names(),
+            sensors=list(self.sensors),
+            members=known.member[rows][:, : len(self.sensors)].copy(),
+            updated_t_ns=self._to_ns_array(known.last_s[rows]),
+            first_t_ns=self._to_ns_array(known.first_s[rows]),
+        )
+
+    def _note_ended(self, ended: list[tuple[int, int, int]]) -> None:
+        """Keep the last words of tracks that ended for the next frame."""
+        if not ended:
+            return
+        rows = np.array([row for row, _, _ in ended], np.int64)
+        frame = self._frame_of(rows, self._now_s, self._seq)
+        status = np.full(len(rows), ENDED, np.uint8)
+        self._ended.append(frame.model_copy(update={"status": status}))
+        self.counters["ended"] += len(rows)
+
+    def _take_ended(self) -> list[TrackFrame]:
+        ended, self._ended = self._ended, []
+        return ended
+
+    # --- time, numbers ---
+
+    def _advance(self, t_s: float) -> None:
+        self._now_s = max(self._now_s, t_s)
+
+    def _to_s(self, t_ns: int) -> float:
+        if self._epoch_ns is None:
+            self._epoch_ns = t_ns - t_ns % 1_000_000_000
+        return (t_ns - self._epoch_ns) / 1e9
+
+    def _to_s_array(self, t_ns: IntArray) -> npt.NDArray[np.float64]:
+        self._to_s(int(t_ns.min()))
+        return np.asarray((t_ns - (self._epoch_ns or 0)) / 1e9)
+
+    def _to_ns(self, t_s: float) -> int:
+        return round(t_s * 1e9) + (self._epoch_ns or 0)
+
+    def _to_ns_array(self, t_s: npt.NDArray[np.float64]) -> IntArray:
+        return np.rint(t_s * 1e9).astype(np.int64) + (self._epoch_ns or 0)
+
+    def _tentative_id(self, rows: IntArray) -> IntArray:
+        # Tentative tracks have no public number yet; theirs is of a range that confirmed ones never reach.
+        return (self.unit.number << _TRACK_BITS) | (1 << (_TRACK_BITS - 1)) | self._system.life.uid[rows]
+
+    def _layer(self, rules: Rules, ring: int, sensors: int) -> Layer:
+        s = self.settings
+        return Layer(self._models, rules, ring, sensors, s.gate, s.sigma_velocity_mps)
+
+    def _rules(self, period_s: float, coast_s: float) -> Rules:
+        s = self.settings
+        return Rules(
+            s.confirm_score, s.confirm_hits, s.score_cap, s.drop_score, s.drop_fall, s.max_misses,
+            _TENTATIVE_AGE_PERIODS * period_s, coast_s,
+        )  # fmt: skip

@@ -1,0 +1,134 @@
+"""What the engine knows of a sensor: where it stands in the system plane, how its plots get there, its clutter."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pymap3d
+
+from trackmesh.protocol.errors import RefusedMessage
+from trackmesh.protocol.messages import Geodetic, PlotBatch, SensorInfo
+from trackmesh.services.estimation.convert import polar_to_plane
+
+FloatArray = npt.NDArray[np.float64]
+
+_LOOKS_REMEMBERED = 5.0
+
+
+class ClutterDensity:
+    """False plots a look and square metre: an exponential mean over the last looks.
+
+    Counted are the plots that no confirmed track took; at a cold start these are all, so that nothing is confirmed too
+    easily.
+    """
+
+    def __init__(self, area_m2: float, declared: float | None) -> None:
+        self._area_m2 = area_m2
+        self._floor = 0.5 / area_m2
+        self._plots = (declared or 0.0) * area_m2
+        self._area_seen_m2 = area_m2 if declared else 0.0
+
+    def add(self, plots: int, share_of_look: float) -> None:
+        """Count the unexplained plots of a batch that was this share of a whole look."""
+        keep = np.exp(-share_of_look / _LOOKS_REMEMBERED)
+        self._plots = self._plots * keep + plots
+        self._area_seen_m2 = self._area_seen_m2 * keep + share_of_look * self._area_m2
+
+    def value(self, plots_now: int, share_of_look: float) -> float:
+        """The present estimate, 1/m^2; before any batch was counted, that of the batch at hand."""
+        if self._area_seen_m2 == 0.0:
+            return max(plots_now / (share_of_look * self._area_m2), self._floor)
+        return max(self._plots / self._area_seen_m2, self._floor)
+
+
+class Sensor:
+    """One sensor in the system plane.
+
+    Attributes:
+        index: its number within the engine.
+        info: what it says of itself.
+        site: (2,) east and north of it in the system plane.
+    """
+
+    def __init__(self, index: int, info: SensorInfo, origin: Geodetic | None) -> None:
+        self.index = index
+        self.info = info
+        self.site, self._turn = _place(info, origin)
+        self._origin = origin
+        area = np.pi * info.max_range_m**2
+        self.local_clutter = ClutterDensity(area, info.clutter_density)
+        self.system_clutter = ClutterDensity(area, info.clutter_density)
+
+    def plane(self, batch: PlotBatch) -> tuple[FloatArray, FloatArray]:
+        """Positions (n, 2) and covariances (n, 3) of a batch in the system plane.
+
+        Raises:
+            RefusedMessage: the batch cannot be placed: no variances, no site, no origin.
+        """
+        variances = self._variances(batch)
+        first = batch.columns[0]
+        if first == "range_m":
+            return self._polar(batch, variances)
+        z = np.ascontiguousarray(batch.values[:, :2]) if first == "east_m" else self._geodetic(batch)
+        return z, np.stack([variances[:, 0], np.zeros(len(z)), variances[:, 1]], axis=1)
+
+    def _variances(self, batch: PlotBatch) -> FloatArray:
+        if batch.variances is not None:
+            return batch.variances
+        for name in batch.columns[:2]:
+            if name not in self.info.sigma:
+                raise RefusedMessage(
+                    "no_variance", f"Sensor {self.info.sensor_id} gives neither variances nor sigma of {name}."
+                )
+        sigma = np.array([self.info.sigma.get(name, np.inf) for name in batch.columns])
+        return np.broadcast_to(sigma * sigma, batch.values.shape)
+
+    def _polar(self, batch: PlotBatch, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
+        if self.info.site is None and self.info.site_enu_m is None:
+            raise RefusedMessage("no_site", f"Sensor {self.info.sensor_id} sends polar plots but has no site.")
+        elevation = batch.values[:, 2] if "elevation_rad" in batch.columns else None
+        z, R = polar_to_plane(batch.values[:, 0], batch.values[:, 1], elevation, variances[:, 0], variances[:, 1])
+        if self._turn is None:
+            return z + self.site, R
+        T = self._turn
+        full = np.stack([R[:, 0], R[:, 1], R[:, 1], R[:, 2]], axis=1).reshape(-1, 2, 2)
+        full = T @ full @ T.T
+        return z @ T.T + self.site, np.stack([full[:, 0, 0], full[:, 0, 1], full[:, 1, 1]], axis=1)
+
+    def _geodetic(self, batch: PlotBatch) -> FloatArray:
+        if self._origin is None:
+            raise RefusedMessage("no_origin", "Geodetic plots need an origin of the system plane.")
+        o = self._origin
+        height = batch.values[:, 2] if batch.values.shape[1] > 2 else np.zeros(len(batch.values))
+        east, north, _ = pymap3d.geodetic2enu(
+            batch.values[:, 0], batch.values[:, 1], height, o.latitude_deg, o.longitude_deg, o.height_m
+        )
+        return np.stack([east, north], axis=1)
+
+
+def _place(info: SensorInfo, origin: Geodetic | None) -> tuple[FloatArray, FloatArray | None]:
+    """The site in the system plane, and the 2x2 turn from the site's own east and north to those of the plane."""
+    if info.site_enu_m is not None:
+        return np.array(info.site_enu_m[:2], float), None
+    if info.site is None or origin is None:
+        return np.zeros(2), None
+    s, o = info.site, origin
+    east, north, _ = pymap3d.geodetic2enu(
+        s.latitude_deg, s.longitude_deg, s.height_m, o.latitude_deg, o.longitude_deg, o.height_m
+    )
+    turn = np.empty((2, 2))
+    for k, step in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))):
+        u, v, w = pymap3d.enu2uvw(*step, s.latitude_deg, s.longitude_deg)
+        east_k, north_k, _ = _uvw2enu(float(u), float(v), float(w), o)
+        turn[:, k] = east_k, north_k
+    return np.array([float(east), float(north)]), turn
+
+
+def _uvw2enu(u: float, v: float, w: float, o: Geodetic) -> tuple[float, float, float]:
+    lat, lon = np.deg2rad(o.latitude_deg), np.deg2rad(o.longitude_deg)
+    along = np.cos(lon) * u + np.sin(lon) * v
+    return (
+        float(-np.sin(lon) * u + np.cos(lon) * v),
+        float(-np.sin(lat) * along + np.cos(lat) * w),
+        float(np.cos(lat) * along + np.sin(lat) * w),
+    )

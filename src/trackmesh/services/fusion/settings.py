@@ -1,0 +1,84 @@
+"""What a fusion unit can be told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from trackmesh.protocol.messages import Geodetic
+from trackmesh.protocol.messages.base import NonNegative, Positive
+from trackmesh.services.estimation.imm import Models, make_models
+from trackmesh.services.runtime import ServiceSettings
+
+
+class EngineSettings(BaseModel):
+    """Constants of the fusion engine; the defaults suit air surveillance by rotating radars."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    filter: Literal["tvimm-dirichlet", "imm"] = Field("tvimm-dirichlet", description="the filter of every track")
+    q_m2ps3: Annotated[list[Positive], Field(min_length=1, max_length=4)] = Field(
+        [1.0, 50.0, 500.0], description="acceleration noise density of each constant-velocity model"
+    )
+    sojourn_s: Annotated[list[Positive], Field(min_length=1, max_length=4)] = Field(
+        [50.0, 15.0, 15.0], description="mean time a target stays in each model"
+    )
+    tpm_prior_count: Positive = Field(20.0, description="weight of the sojourn times against observed transitions")
+    tpm_memory_s: Positive = Field(80.0, description="how long observed transitions are remembered")
+    tpm_reference_s: Positive = Field(4.0, description="interval whose expected transition counts as one")
+    sigma_velocity_mps: Positive = Field(150.0, description="velocity of a new track, one sigma per axis")
+    gate: Positive = Field(16.0, description="largest squared Mahalanobis distance of a plot to a track's model")
+    confirm_score: Positive = Field(12.0, description="log-likelihood ratio that confirms a track")
+    confirm_hits: Annotated[int, Field(ge=1)] = Field(3, description="plots a track needs to be confirmed")
+    score_cap: Positive = 30.0
+    drop_score: Annotated[float, Field(lt=0)] = -2.0
+    drop_fall: Positive = 6.0
+    max_misses: Annotated[int, Field(ge=1)] = 3
+    coast_s: Positive = Field(15.0, description="a confirmed track ends after this time without a plot")
+    local_coast_periods: Positive = 4.0
+    ring_system: Annotated[int, Field(ge=2, le=512)] = Field(24, description="plots a system track can replay")
+    ring_local: Annotated[int, Field(ge=2, le=512)] = 12
+    max_lateness_s: Positive = Field(10.0, description="plots older than this are dropped and counted")
+    cycle_s: Positive = Field(2.0, description="association cycle")
+    pair_speed_mps: Positive = Field(250.0, description="spread of velocities expected of unrelated tracks, per axis")
+    pair_radius_m: Positive = Field(10_000.0, description="radius in which the density of tracks is counted")
+    frame_period_s: NonNegative = Field(0.0, description="least time between frames; 0: one after every batch")
+    idle_frame_s: Positive = Field(1.0, description="time between frames while no data comes")
+    publish_tentative: bool = False
+
+    @model_validator(mode="after")
+    def _same_models(self) -> Self:
+        if len(self.q_m2ps3) != len(self.sojourn_s):
+            raise ValueError("q_m2ps3 and sojourn_s must be equally long")
+        return self
+
+    def models(self) -> Models:
+        """The models of the filter."""
+        prior = self.tpm_prior_count if self.filter == "tvimm-dirichlet" else np.inf
+        q, tau = np.array(self.q_m2ps3), np.array(self.sojourn_s)
+        return make_models(q, tau, prior, self.tpm_memory_s, self.tpm_reference_s)
+
+    def model_names(self) -> list[str]:
+        """Names of the models in a frame."""
+        return [f"cv-{q:g}" for q in self.q_m2ps3]
+
+
+class FusionSettings(ServiceSettings):
+    """Settings of the fusion service."""
+
+    unit_number: Annotated[int, Field(ge=0, le=4095)] = Field(
+        0, description="number of this unit, unique in the realm: the high bits of its track ids"
+    )
+    origin: Geodetic | None = Field(None, description="origin of the system plane; default: the first geodetic site")
+    engine: EngineSettings = EngineSettings()
+    clock: Literal["wall", "data"] = Field(
+        "wall", description="wall: plots must be of now; data: time is that of the plots (replayed recordings)"
+    )
+    max_age_s: Positive = Field(60.0, description="wall clock: plots older than this are refused")
+    max_ahead_s: Positive = Field(2.0, description="wall clock: plots further in the future are refused")
+    max_batch_bytes: Annotated[int, Field(ge=1024)] = Field(4 * 2**20, description="larger plot batches are refused")
+    tick_s: Positive = Field(0.25, description="how often time advances without data")
+    black_box: Path | None = Field(None, description="file that records the engine's inputs")
