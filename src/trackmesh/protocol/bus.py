@@ -1,13 +1,16 @@
 """The bus: publish, subscribe, query, serve, alive.
 
-Everything above the network is written against ``Bus``. ``MemoryBus`` here joins parts of one process, for tests and
-offline use; ``zenoh_bus.ZenohBus`` joins hosts. Payloads are bytes, the codec is the caller's.
+Everything above the network is written against ``Bus``. ``memory_bus.MemoryBus`` joins parts of one process, for tests
+and offline use; ``zenoh_bus.ZenohBus`` joins hosts. Payloads are bytes, the codec is the caller's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple, Protocol, Self
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+"""Where a router is looked for, and listens, unless told otherwise."""
 
 
 class Sample(NamedTuple):
@@ -35,7 +38,8 @@ class Query(NamedTuple):
 
 
 QueryHandler = Callable[[Query], Iterable[tuple[bytes, str]]]
-"""Answers a query: yields (payload, encoding) of each reply as it is ready. It runs in a worker thread."""
+"""Answers a query: yields (payload, encoding) of each reply as it is ready. It runs in a worker thread; if it raises,
+the asker gets one more reply, an error envelope with the code ``internal``."""
 
 
 class Closeable(Protocol):
@@ -49,11 +53,17 @@ class Publisher(Closeable, Protocol):
     """A declared publisher of one key."""
 
     def put(self, payload: bytes, encoding: str) -> None:
-        """Publish one message. Never blocks on a slow or absent network."""
+        """Publish one message. Never blocks on a slow or absent network, never raises for it; nothing once closed."""
 
 
 class Subscription(Closeable, Protocol):
-    """Messages of a key expression, oldest first, in a bounded buffer that drops the oldest."""
+    """Messages of a key expression, oldest first, in a bounded buffer that drops the oldest.
+
+    Attributes:
+        dropped: how many messages gave way because nobody took them in time.
+    """
+
+    dropped: int
 
     def receive(self, timeout_s: float | None = None) -> Sample | None:
         """The next message, or None when the time is over or the subscription is closed."""
@@ -63,10 +73,16 @@ class Subscription(Closeable, Protocol):
 
 
 class AliveSubscription(Closeable, Protocol):
-    """Comings and goings of liveliness tokens, starting with those already there."""
+    """Comings and goings of liveliness tokens, starting with those already there.
+
+    Who loses the network hears all tokens go, and come again with it.
+    """
 
     def receive(self, timeout_s: float | None = None) -> AliveEvent | None:
         """The next event, or None when the time is over or the subscription is closed."""
+
+    def __iter__(self) -> Iterator[AliveEvent]:
+        """Events until the subscription is closed."""
 
 
 class Bus(Protocol):
@@ -77,7 +93,8 @@ class Bus(Protocol):
 
         Args:
             key: a whole key.
-            history: how many messages are kept for late joiners and to fill the gaps of an outage; 0 for none.
+            history: how many messages are kept for late joiners and to fill the gaps of an outage; 0 for none. They are
+                gone with the publisher.
         """
 
     def subscribe(self, expression: str, *, history: bool = False, capacity: int = 256) -> Subscription:
@@ -92,10 +109,14 @@ class Bus(Protocol):
         parameters: str = "",
         timeout_s: float = 2.0,
     ) -> Iterator[Sample]:
-        """Ask, and iterate over the replies as they come; ends when all servers are done or the time is over."""
+        """Ask all servers of an expression, and iterate over the replies as they come, in order for each server.
+
+        Ends when all servers are done, when they are gone, or ``timeout_s`` after the call; which of these it was, the
+        envelopes tell. The question is sent by the call itself, not by the first step of the iteration.
+        """
 
     def serve(self, key: str, handler: QueryHandler, *, workers: int = 2) -> Closeable:
-        """Answer queries to a key, ``workers`` at a time."""
+        """Answer queries to a key, ``workers`` at a time; a bounded number waits, more are answered ``busy``."""
 
     def declare_alive(self, key: str) -> Closeable:
         """Declare a liveliness token."""

@@ -7,120 +7,128 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections import deque
-from collections.abc import Iterator
-from typing import Generic, Self, TypeVar
+from collections.abc import Callable, Iterator
+from typing import Self, TypeVar
 
+from trackmesh.protocol.buffer import Buffer
 from trackmesh.protocol.bus import AliveEvent, Query, QueryHandler, Sample
 from trackmesh.protocol.errors import BusError
 from trackmesh.protocol.keys import matches, parse_parameters
+from trackmesh.protocol.serving import Job, QueryPool
 
-T = TypeVar("T")
-
-
-class Buffer(Generic[T]):
-    """A bounded, closable buffer that drops the oldest; ``dropped`` counts what it lost."""
-
-    def __init__(self, expression: str, capacity: int) -> None:
-        self.expression = expression
-        self.dropped = 0
-        self._items: deque[T] = deque()
-        self._capacity = capacity
-        self._closed = False
-        self._changed = threading.Condition()
-
-    def offer(self, item: T) -> None:
-        """Append an item; the oldest gives way when full."""
-        with self._changed:
-            if self._closed:
-                return
-            if len(self._items) >= self._capacity:
-                self._items.popleft()
-                self.dropped += 1
-            self._items.append(item)
-            self._changed.notify()
-
-    def receive(self, timeout_s: float | None = None) -> T | None:
-        """The oldest item, or None after ``timeout_s`` or when closed and empty."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._items or self._closed, timeout_s)
-            return self._items.popleft() if self._items else None
-
-    def close(self) -> None:
-        """No more items; a waiting receiver wakes."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-
-    def __iter__(self) -> Iterator[T]:
-        while (item := self.receive()) is not None:
-            yield item
+D = TypeVar("D", bound="_Declared")
+ALIVE_CAPACITY = 65_536
 
 
 class MemoryHub:
-    """What participants share."""
+    """What participants share; ``lock`` guards the lists."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
-        self.subscriptions: list[Buffer[Sample]] = []
-        self.watchers: list[Buffer[AliveEvent]] = []
-        self.servers: list[tuple[str, QueryHandler]] = []
-        self.tokens: list[str] = []
-        self.kept: dict[str, deque[Sample]] = {}
+        self.subscriptions: list[_Subscription] = []
+        self.watchers: list[_Watcher] = []
+        self.publishers: list[_MemoryPublisher] = []
+        self.servers: list[_Server] = []
+        self.tokens: list[_Token] = []
+
+    def alive(self, expression: str) -> list[str]:
+        """Keys of the tokens that meet an expression, sorted."""
+        with self.lock:
+            return sorted({token.key for token in self.tokens if matches(expression, token.key)})
+
+    def announce(self, event: AliveEvent) -> None:
+        """Tell watchers."""
+        for watcher in self.watchers:
+            if matches(watcher.expression, event.key):
+                watcher.offer(event)
 
 
 class _Declared:
-    def __init__(self, undo: list[tuple[object, list[object]]]) -> None:
-        self._undo = undo
+    """Something of a participant that its hub lists until it is closed."""
+
+    def __init__(self, hub: MemoryHub, place: list[Self]) -> None:
+        self.hub = hub
+        self._place = place
+        with hub.lock:
+            place.append(self)
+
+    def _leave(self) -> bool:
+        with self.hub.lock:
+            if self not in self._place:
+                return False
+            self._place.remove(self)
+            return True
 
     def close(self) -> None:
-        for item, place in self._undo:
-            if item in place:
-                place.remove(item)
-        self._undo = []
+        self._leave()
 
 
-class _MemoryPublisher:
-    def __init__(self, hub: MemoryHub, key: str, history: int) -> None:
+class _Subscription(Buffer[Sample]):
+    def __init__(self, hub: MemoryHub, expression: str, capacity: int) -> None:
+        super().__init__(capacity)
+        self.on_close(self._leave)
+        self.expression = expression
         self._hub = hub
-        self._key = key
-        self._history = history
+
+    def _leave(self) -> None:
+        with self._hub.lock:
+            self._hub.subscriptions.remove(self)
+
+
+class _Watcher(Buffer[AliveEvent]):
+    def __init__(self, hub: MemoryHub, expression: str) -> None:
+        super().__init__(ALIVE_CAPACITY)
+        self.on_close(self._leave)
+        self.expression = expression
+        self._hub = hub
+
+    def _leave(self) -> None:
+        with self._hub.lock:
+            self._hub.watchers.remove(self)
+
+
+class _MemoryPublisher(_Declared):
+    def __init__(self, hub: MemoryHub, key: str, history: int) -> None:
+        self.key = key
+        self.kept: deque[Sample] = deque(maxlen=history)
+        super().__init__(hub, hub.publishers)
 
     def put(self, payload: bytes, encoding: str) -> None:
-        sample = Sample(self._key, bytes(payload), encoding)
-        with self._hub.lock:
-            if self._history:
-                self._hub.kept.setdefault(self._key, deque(maxlen=self._history)).append(sample)
-            for subscription in self._hub.subscriptions:
-                if matches(subscription.expression, self._key):
+        sample = Sample(self.key, bytes(payload), encoding)
+        with self.hub.lock:
+            if self not in self._place:
+                return
+            self.kept.append(sample)
+            for subscription in self.hub.subscriptions:
+                if matches(subscription.expression, self.key):
                     subscription.offer(sample)
 
+
+class _Server(_Declared):
+    def __init__(self, hub: MemoryHub, key: str, handler: QueryHandler, workers: int) -> None:
+        self.key = key
+        self.pool = QueryPool(handler, workers)
+        super().__init__(hub, hub.servers)
+
     def close(self) -> None:
-        pass
+        if self._leave():
+            self.pool.close()
 
 
-class _Token:
+class _Token(_Declared):
     def __init__(self, hub: MemoryHub, key: str) -> None:
-        self._hub: MemoryHub | None = hub
-        self._key = key
+        self.key = key
         with hub.lock:
-            hub.tokens.append(key)
-            _announce(hub, AliveEvent(key, True))
+            if not hub.alive(key):
+                hub.announce(AliveEvent(key, True))
+            super().__init__(hub, hub.tokens)
 
     def close(self) -> None:
-        hub, self._hub = self._hub, None
-        if hub is None:
-            return
-        with hub.lock:
-            hub.tokens.remove(self._key)
-            if self._key not in hub.tokens:
-                _announce(hub, AliveEvent(self._key, False))
-
-
-def _announce(hub: MemoryHub, event: AliveEvent) -> None:
-    for watcher in hub.watchers:
-        if matches(watcher.expression, event.key):
-            watcher.offer(event)
+        with self.hub.lock:
+            if self._leave() and not self.hub.alive(self.key):
+                self.hub.announce(AliveEvent(self.key, False))
 
 
 class MemoryBus:
@@ -128,26 +136,24 @@ class MemoryBus:
 
     def __init__(self, hub: MemoryHub | None = None) -> None:
         self.hub = hub or MemoryHub()
-        self._declared: list[Buffer[Sample] | Buffer[AliveEvent] | _Declared | _Token] = []
+        self._closing: list[Callable[[], None]] = []
         self._closed = False
 
     def publisher(self, key: str, *, history: int = 0) -> _MemoryPublisher:
         """See ``Bus.publisher``."""
-        self._check_open()
-        return _MemoryPublisher(self.hub, key, history)
+        return self._mine(_MemoryPublisher(self._open_hub(), key, history))
 
     def subscribe(self, expression: str, *, history: bool = False, capacity: int = 256) -> Buffer[Sample]:
         """See ``Bus.subscribe``."""
-        self._check_open()
-        buffer: Buffer[Sample] = Buffer(expression, capacity)
-        with self.hub.lock:
-            if history:
-                for key, samples in self.hub.kept.items():
-                    for sample in samples if matches(expression, key) else ():
-                        buffer.offer(sample)
-            self.hub.subscriptions.append(buffer)
-        self._declared.append(buffer)
-        return buffer
+        hub = self._open_hub()
+        subscription = _Subscription(hub, expression, capacity)
+        with hub.lock:
+            for publisher in hub.publishers if history else ():
+                for sample in publisher.kept if matches(expression, publisher.key) else ():
+                    subscription.offer(sample)
+            hub.subscriptions.append(subscription)
+        self._closing.append(subscription.close)
+        return subscription
 
     def query(
         self,
@@ -158,78 +164,45 @@ class MemoryBus:
         parameters: str = "",
         timeout_s: float = 2.0,
     ) -> Iterator[Sample]:
-        """See ``Bus.query``; each server answers in a thread of its own."""
-        self._check_open()
-        wanted = parse_parameters(parameters)
+        """See ``Bus.query``."""
+        hub = self._open_hub()
+        deadline = time.monotonic() + timeout_s
         replies: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
-        with self.hub.lock:
-            servers = [(key, handler) for key, handler in self.hub.servers if matches(expression, key)]
+        with hub.lock:
+            servers = [server for server in hub.servers if matches(expression, server.key)]
+        for server in servers:
+            question = Query(server.key, parse_parameters(parameters), payload, encoding)
+            server.pool.submit(_job(question, replies))
+        return _replies(replies, len(servers), deadline)
 
-        def ask(key: str, handler: QueryHandler) -> None:
-            try:
-                for data, enc in handler(Query(key, wanted, payload, encoding)):
-                    replies.put(Sample(key, bytes(data), enc))
-            finally:
-                replies.put(None)
-
-        for key, handler in servers:
-            threading.Thread(target=ask, args=(key, handler), daemon=True).start()
-        running = len(servers)
-        while running:
-            try:
-                reply = replies.get(timeout=timeout_s)
-            except queue.Empty:
-                return
-            if reply is None:
-                running -= 1
-            else:
-                yield reply
-
-    def serve(self, key: str, handler: QueryHandler, *, workers: int = 2) -> _Declared:
+    def serve(self, key: str, handler: QueryHandler, *, workers: int = 2) -> _Server:
         """See ``Bus.serve``."""
-        self._check_open()
-        entry = (key, handler)
-        with self.hub.lock:
-            self.hub.servers.append(entry)
-        declared = _Declared([(entry, self.hub.servers)])  # type: ignore[list-item]
-        self._declared.append(declared)
-        return declared
+        return self._mine(_Server(self._open_hub(), key, handler, workers))
 
     def declare_alive(self, key: str) -> _Token:
         """See ``Bus.declare_alive``."""
-        self._check_open()
-        token = _Token(self.hub, key)
-        self._declared.append(token)
-        return token
+        return self._mine(_Token(self._open_hub(), key))
 
     def alive(self, expression: str, *, timeout_s: float = 1.0) -> list[str]:
         """See ``Bus.alive``."""
-        with self.hub.lock:
-            return sorted({t for t in self.hub.tokens if matches(expression, t)})
+        return self._open_hub().alive(expression)
 
     def watch_alive(self, expression: str) -> Buffer[AliveEvent]:
         """See ``Bus.watch_alive``."""
-        self._check_open()
-        watcher: Buffer[AliveEvent] = Buffer(expression, 4096)
-        with self.hub.lock:
-            for token in sorted(set(self.hub.tokens)):
-                if matches(expression, token):
-                    watcher.offer(AliveEvent(token, True))
-            self.hub.watchers.append(watcher)
-        self._declared.append(watcher)
+        hub = self._open_hub()
+        watcher = _Watcher(hub, expression)
+        with hub.lock:
+            for key in hub.alive(expression):
+                watcher.offer(AliveEvent(key, True))
+            hub.watchers.append(watcher)
+        self._closing.append(watcher.close)
         return watcher
 
     def close(self) -> None:
         """See ``Bus.close``."""
         self._closed = True
-        for declared in reversed(self._declared):
-            declared.close()
-            with self.hub.lock:
-                if isinstance(declared, Buffer):
-                    for place in (self.hub.subscriptions, self.hub.watchers):
-                        if declared in place:
-                            place.remove(declared)  # type: ignore[arg-type]
-        self._declared = []
+        while self._closing:
+            self._closing.pop()()
 
     def __enter__(self) -> Self:
         return self
@@ -237,6 +210,30 @@ class MemoryBus:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def _check_open(self) -> None:
+    def _open_hub(self) -> MemoryHub:
         if self._closed:
             raise BusError("The bus is closed.")
+        return self.hub
+
+    def _mine(self, declared: D) -> D:
+        self._closing.append(declared.close)
+        return declared
+
+
+def _job(question: Query, replies: queue.SimpleQueue[Sample | None]) -> Job:
+    def reply(payload: bytes, encoding: str) -> None:
+        replies.put(Sample(question.key, bytes(payload), encoding))
+
+    return Job(question, reply, lambda: replies.put(None))
+
+
+def _replies(replies: queue.SimpleQueue[Sample | None], servers: int, deadline: float) -> Iterator[Sample]:
+    while servers:
+        try:
+            reply = replies.get(timeout=max(0.0, deadline - time.monotonic()))
+        except queue.Empty:
+            return
+        if reply is None:
+            servers -= 1
+        else:
+            yield reply

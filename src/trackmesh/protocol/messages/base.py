@@ -67,8 +67,10 @@ class Message(BaseModel):
             if value is None:
                 continue
             shape = value.shape if isinstance(value, np.ndarray) else (len(value),)
-            for axis, got in zip(axes, shape, strict=True):
-                if isinstance(axis, str) and length.setdefault(axis, got) != got and not _empty(value):
+            # An array without rows came from JSON as []: its other axes are unknown, not wrong.
+            known = 1 if shape[0] == 0 else len(shape)
+            for axis, got in zip(axes[:known], shape[:known], strict=True):
+                if isinstance(axis, str) and length.setdefault(axis, got) != got:
                     raise PydanticCustomError(
                         "wrong_length",
                         "{field} has {got} along its axis {axis}, where {want} are needed",
@@ -93,11 +95,6 @@ class TopMessage(Message):
     def schema_id(cls) -> str:
         """The schema's name as it stands in the encoding: ``trackmesh.PlotBatch.v1``."""
         return f"trackmesh.{cls.__name__}.v1"
-
-
-def _empty(value: Any) -> bool:
-    # An empty (0, c) array came from JSON as []: its other axes are unknown, not wrong.
-    return isinstance(value, np.ndarray) and value.size == 0 and value.shape[0] == 0 and value.ndim > 1
 
 
 def _equal(a: Any, b: Any) -> bool:

@@ -35,12 +35,15 @@ _MERGE_GATE = 25.0
 _HITS_FOR_TEST = 3
 _TRACK_BITS = 41
 
+TRACK_EPOCH_MS = 1_577_836_800_000
+"""2020-01-01 in Unix milliseconds: track numbers begin at the milliseconds since then, so no restart repeats one."""
+
 
 class Unit(NamedTuple):
     """Who the engine is: its names in frames and the numbers it gives to tracks.
 
     Track ids are ``number << 41 | n`` with n counting up from ``first_track``, so that they are unique over units and
-    restarts.
+    restarts; 0 stands for the milliseconds from 2020 to the first data.
     """
 
     unit_id: str = "main"
@@ -111,8 +114,8 @@ class FusionEngine:
         sensor = self.sensors.get(batch.sensor_id)
         if sensor is None:
             raise RefusedMessage("unknown_sensor", f"Nothing is known of sensor {batch.sensor_id} yet.")
-        z, R = sensor.plane(batch)
-        if len(z):
+        if len(batch.t_ns):
+            z, R = sensor.plane(batch)
             self._take(sensor, batch, z, R)
         return self._due_frame(self.settings.frame_period_s)
 
@@ -321,6 +324,7 @@ class FusionEngine:
     def _to_s(self, t_ns: int) -> float:
         if self._epoch_ns is None:
             self._epoch_ns = t_ns - t_ns % 1_000_000_000
+            self._next_track = self._next_track or max(1, self._epoch_ns // 1_000_000 - TRACK_EPOCH_MS)
         return (t_ns - self._epoch_ns) / 1e9
 
     def _to_s_array(self, t_ns: IntArray) -> npt.NDArray[np.float64]:

@@ -147,9 +147,9 @@ def miss(
     """Judge the looks of ``sensor`` up to time ``t_s`` at rows that it can see and that took no plot of it.
 
     A radar (``lately_s`` infinite) sees what is within ``max_range_m`` of its ``site``; any other sensor sees what it
-    has seen within ``lately_s``. Where the batch is a ``whole`` look, a row is judged when half a period has passed since
-    its last judged look; where it is a sector, when a period and ``margin_s`` have, so that a plot one sector late
-    is no miss.
+    has seen within ``lately_s``. Where the batch is a ``whole`` look, a row is judged when half a period has passed
+    since its last judged look; where it is a sector, when a period and ``margin_s`` have, so that a plot one sector
+    late is no miss.
 
     Args:
         mean, t_state_s: (all rows, 4), (all rows,) mean states and their times, to extrapolate.

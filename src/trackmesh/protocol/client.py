@@ -1,0 +1,258 @@
+"""The SDK: watch and query tracks, ask who is there, invert scans, publish plots.
+
+Example::
+
+    with ZenohBus.open(["tcp/host:7447"]) as bus:
+        for frame in Client(bus).watch_tracks():
+            print(frame.t_ns, len(frame.track_id))
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Iterator
+from typing import Generic, NamedTuple, Self, TypeVar
+
+from trackmesh.protocol.bus import Bus, Sample, Subscription
+from trackmesh.protocol.codec import decode, encode, encoding, open_envelope
+from trackmesh.protocol.errors import BusError, RefusedMessage, Unavailable
+from trackmesh.protocol.keys import DEFAULT_REALM, Keys, kind_and_id, last_chunk
+from trackmesh.protocol.messages import (
+    EmiResult,
+    EmiScanBatch,
+    HistoryQuery,
+    SensorInfo,
+    ServiceStatus,
+    TrackFrame,
+    TrackQuery,
+)
+from trackmesh.protocol.messages.base import TopMessage
+from trackmesh.protocol.picture import Picture, TrackPicture
+from trackmesh.protocol.sensor import SensorPublisher
+
+__all__ = ["Client", "Incomplete", "Picture", "SensorPublisher", "TrackPicture", "Watch", "message_of"]
+
+M = TypeVar("M", bound=TopMessage)
+
+_log = logging.getLogger(__name__)
+
+_NAMES = ("sensor_id", "network_id", "unit_id", "scenario_id")
+_SERVED_BY = {"tracks": "fusion", "history": "archive", "emi": "emi"}
+
+
+class Incomplete(BusError):
+    """A service ended half-way through its answer.
+
+    Attributes:
+        received: how many answers came before.
+    """
+
+    def __init__(self, sentence: str, received: int) -> None:
+        super().__init__(sentence)
+        self.received = received
+
+
+def message_of(sample: Sample, kind: type[M]) -> M:
+    """The message of a sample, whose id must be that of its key.
+
+    Raises:
+        RefusedMessage: whatever is wrong with it; ``wrong_key`` if it speaks for somebody else.
+    """
+    message = decode(sample.payload, kind, sample.encoding)
+    name = next(getattr(message, field) for field in _NAMES if hasattr(message, field))
+    if name != last_chunk(sample.key):
+        raise RefusedMessage("wrong_key", f"{sample.key} brought a {kind.__name__} of {name}.")
+    return message
+
+
+class Watch(Generic[M]):
+    """Messages as they come; iterate over it, or ``receive`` with a time limit.
+
+    Attributes:
+        refused: how many were refused, by reason.
+    """
+
+    def __init__(self, subscription: Subscription, kind: type[M]) -> None:
+        self.refused: Counter[str] = Counter()
+        self._subscription = subscription
+        self._kind = kind
+
+    @property
+    def dropped(self) -> int:
+        """How many gave way because nobody took them in time."""
+        return self._subscription.dropped
+
+    def receive(self, timeout_s: float | None = None) -> M | None:
+        """The next good message, or None when the time is over or the watch is closed."""
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            left_s = None if deadline is None else max(0.0, deadline - time.monotonic())
+            sample = self._subscription.receive(left_s)
+            if sample is None:
+                return None
+            try:
+                return message_of(sample, self._kind)
+            except RefusedMessage as error:
+                self.refused[error.reason] += 1
+
+    def close(self) -> None:
+        """Watch no longer; an iteration ends."""
+        self._subscription.close()
+
+    def __iter__(self) -> Iterator[M]:
+        while (message := self.receive()) is not None:
+            yield message
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+class _Stream(NamedTuple):
+    """What was asked of whom, for the sentence when it goes wrong."""
+
+    kind: str
+    unit: str
+    asked_s: float
+    timeout_s: float
+    expected: int | None
+
+    def broken_off(self, unit: str, received: int) -> Incomplete:
+        late = time.monotonic() - self.asked_s >= self.timeout_s
+        what = f"did not finish within {self.timeout_s:g} s" if late else "ended half-way"
+        part = f"{received} of {self.expected}" if self.expected is not None else f"{received}"
+        return Incomplete(f"The {self.kind} service {unit} {what}: {part} answers received.", received)
+
+
+class Client:
+    """What a user of a realm can ask and watch.
+
+    Args:
+        bus: a way into the network; it is not closed by the client.
+        realm: the deployment's key space.
+    """
+
+    def __init__(self, bus: Bus, realm: str = DEFAULT_REALM) -> None:
+        self.bus = bus
+        self.keys = Keys(realm)
+
+    # --- watching ---
+
+    def watch_tracks(self, unit: str = "*", *, history: bool = True, capacity: int = 4096) -> Watch[TrackFrame]:
+        """Frames as they are published; with ``history`` those lost in an outage too, and the last few before now."""
+        return Watch(self.bus.subscribe(self.keys.tracks(unit), history=history, capacity=capacity), TrackFrame)
+
+    def watch_statuses(self, kind: str = "*", unit: str = "*") -> Watch[ServiceStatus]:
+        """How services are, once a second each, the present first."""
+        return Watch(self.bus.subscribe(self.keys.status(kind, unit), history=True), ServiceStatus)
+
+    # --- asking ---
+
+    def query_tracks(
+        self, query: TrackQuery | None = None, unit: str = "*", *, timeout_s: float = 2.0
+    ) -> list[TrackFrame]:
+        """The present picture, one frame a unit, ordered by unit.
+
+        Raises:
+            Unavailable: no unit answers.
+            Incomplete: a unit ended before its answer was whole.
+            QueryFailed: a unit answers with an error.
+        """
+        frames = list(self._ask("tracks", query or TrackQuery(), TrackFrame, unit, timeout_s))
+        self._warn_of_silent(unit, {frame.unit_id for frame in frames})
+        return sorted(frames, key=lambda frame: frame.unit_id)
+
+    def history(self, query: HistoryQuery, unit: str = "*", *, timeout_s: float = 30.0) -> Iterator[TrackFrame]:
+        """Past frames, as the archive finds them; raises as ``query_tracks``."""
+        return self._ask("history", query, TrackFrame, unit, timeout_s)
+
+    def invert(self, batch: EmiScanBatch, unit: str = "*", *, timeout_s: float = 60.0) -> Iterator[EmiResult]:
+        """One result a scan, each as it is done; by one service, whichever is alive where ``unit`` is not given.
+
+        Raises:
+            Unavailable: no service answers.
+            Incomplete: the service ended before all scans were done.
+            QueryFailed: the service answers with an error.
+        """
+        if unit == "*":
+            unit = next(iter(self._alive_units("emi")), "*")
+        return self._ask("emi", batch, EmiResult, unit, timeout_s, expected=len(batch.field))
+
+    def sensors(self, sensor: str = "*", *, timeout_s: float = 2.0) -> list[SensorInfo]:
+        """The sensors that are there, ordered by id; those that do not answer well are left out."""
+        found: dict[str, SensorInfo] = {}
+        for reply in self.bus.query(self.keys.sensor(sensor), timeout_s=timeout_s):
+            try:
+                info = open_envelope(reply.payload, reply.encoding, SensorInfo)
+            except RefusedMessage as error:
+                _log.warning("%s gave no information: %s", reply.key, error)
+                continue
+            if isinstance(info, SensorInfo) and info.sensor_id == last_chunk(reply.key):
+                found[info.sensor_id] = info
+        return [found[name] for name in sorted(found)]
+
+    def statuses(self, *, timeout_s: float = 2.0) -> list[ServiceStatus]:
+        """How the services are that are alive, ordered by kind and id; those not heard in time are left out."""
+        wanted = {who for who in self.alive() if who[0] != "sensor"}
+        heard: dict[tuple[str, str], ServiceStatus] = {}
+        deadline = time.monotonic() + timeout_s
+        with self.watch_statuses() as watch:
+            while wanted - heard.keys() and (left_s := deadline - time.monotonic()) > 0:
+                if (status := watch.receive(left_s)) is not None:
+                    heard[status.kind, status.unit_id] = status
+        return [heard[who] for who in sorted(heard) if who in wanted]
+
+    def alive(self, kind: str = "*") -> list[tuple[str, str]]:
+        """Kind and id of the sensors and services that are alive, ordered."""
+        return [kind_and_id(key) for key in self.bus.alive(self.keys.live(kind, "*"))]
+
+    # --- how ---
+
+    def _ask(
+        self, service: str, query: TopMessage, kind: type[M], unit: str, timeout_s: float, expected: int | None = None
+    ) -> Iterator[M]:
+        asked_s = time.monotonic()
+        replies = self.bus.query(self.keys.service(service, unit), encode(query), encoding(query), timeout_s=timeout_s)
+        # A generator of its own: the question is on its way before the first answer is asked for.
+        return self._open(replies, kind, _Stream(_SERVED_BY[service], unit, asked_s, timeout_s, expected))
+
+    def _open(self, replies: Iterator[Sample], kind: type[M], stream: _Stream) -> Iterator[M]:
+        counts: Counter[str] = Counter()
+        open_: set[str] = set()
+        for reply in replies:
+            open_.add(reply.key)
+            opened = open_envelope(reply.payload, reply.encoding, kind)
+            if not isinstance(opened, int):
+                counts[reply.key] += 1
+                yield opened
+            elif opened == counts[reply.key]:
+                counts[reply.key] += 0
+                open_.discard(reply.key)
+        if not counts and not open_:
+            raise Unavailable(self._why_silent(stream))
+        for key in sorted(open_):
+            raise stream.broken_off(last_chunk(key), counts[key])
+
+    def _alive_units(self, kind: str) -> list[str]:
+        return [ident for _, ident in self.alive(kind)]
+
+    def _why_silent(self, stream: _Stream) -> str:
+        kind, unit = stream.kind, stream.unit
+        alive = self._alive_units(kind)
+        if unit != "*" and unit not in alive:
+            others = f"; alive: {', '.join(alive)}" if alive else ", nor is any other"
+            return f"The {kind} service {unit} is not alive{others}."
+        if not alive:
+            return f"No {kind} service is alive."
+        silent = alive if unit == "*" else [unit]
+        who = f"service {silent[0]} is" if len(silent) == 1 else f"services {', '.join(silent)} are"
+        return f"The {kind} {who} alive but did not answer within {stream.timeout_s:g} s."
+
+    def _warn_of_silent(self, unit: str, answered: set[str]) -> None:
+        # A picture with a hole looks like a whole one.
+        for silent in sorted(set(self._alive_units("fusion")) - answered) if unit == "*" else ():
+            _log.warning("the fusion service %s is alive but did not answer; its tracks are missing", silent)

@@ -1,0 +1,103 @@
+"""The sensor's side: who it is, that it is alive, and its plots."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections.abc import Iterator, Sequence
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import ValidationError
+
+from trackmesh.protocol.arrays import IntArray
+from trackmesh.protocol.bus import Bus, Query
+from trackmesh.protocol.codec import answer, encode, encoding, end, refusal
+from trackmesh.protocol.keys import Keys
+from trackmesh.protocol.messages import Envelope, PlotBatch, ScanPart, SensorInfo
+from trackmesh.protocol.serving import asked_format
+
+PLOT_HISTORY = 64
+
+
+class SensorPublisher:
+    """A sensor on the bus: it is alive, publishes and answers who it is, and publishes its plots.
+
+    Args:
+        bus: a way into the network; it is not closed.
+        realm: the deployment's key space.
+        info: who the sensor is.
+        history: how many batches are kept to fill the gaps of an outage; 0 for none.
+
+    Attributes:
+        boot_id: drawn anew for each publisher.
+    """
+
+    def __init__(self, bus: Bus, realm: str, info: SensorInfo, *, history: int = PLOT_HISTORY) -> None:
+        keys = Keys(realm)
+        self.info = info
+        self.boot_id = uuid.uuid4().hex[:16]
+        self._seq = 0
+        self._lock = threading.Lock()
+        self._info_publisher = bus.publisher(keys.sensor(info.sensor_id), history=1)
+        self._plots = bus.publisher(keys.plots(info.sensor_id), history=history)
+        self._server = bus.serve(keys.sensor(info.sensor_id), self._who, workers=1)
+        self._token = bus.declare_alive(keys.live("sensor", info.sensor_id))
+        self.announce(info)
+
+    def announce(self, info: SensorInfo) -> None:
+        """Publish who the sensor is, when it has changed."""
+        self.info = info
+        self._info_publisher.put(encode(info), encoding(info))
+
+    def publish(
+        self,
+        t_ns: IntArray | Sequence[int],
+        columns: Sequence[str],
+        values: npt.ArrayLike,
+        *,
+        variances: npt.ArrayLike | None = None,
+        labels: Sequence[str] | None = None,
+        scan: ScanPart | None = None,
+    ) -> PlotBatch:
+        """Publish the plots of a scan or sector, also when there are none; the batch as published.
+
+        Raises:
+            RefusedMessage: the plots are no valid ``PlotBatch``.
+        """
+        table = np.asarray(values, np.float64)
+        with self._lock:
+            try:
+                batch = PlotBatch(
+                    sensor_id=self.info.sensor_id,
+                    boot_id=self.boot_id,
+                    seq=self._seq,
+                    t_ns=np.asarray(t_ns, np.int64),
+                    columns=list(columns),
+                    values=table if table.size else table.reshape(0, len(columns)),
+                    variances=None if variances is None else np.asarray(variances, np.float64),
+                    labels=None if labels is None else list(labels),
+                    scan=scan,
+                )
+            except ValidationError as error:
+                raise refusal("PlotBatch", error) from None
+            self._seq += 1
+            self._plots.put(encode(batch), encoding(batch))
+        return batch
+
+    def close(self) -> None:
+        """Be alive no longer."""
+        for declared in (self._token, self._server, self._plots, self._info_publisher):
+            declared.close()
+
+    def _who(self, query: Query) -> Iterator[tuple[bytes, str]]:
+        fmt = asked_format(query)
+        yield answer(self.info, fmt), encoding(Envelope, fmt)
+        yield end(1, fmt), encoding(Envelope, fmt)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()

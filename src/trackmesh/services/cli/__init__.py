@@ -1,0 +1,1 @@
+"""The command ``trackmesh``: everything a person can start, watch, ask or convert."""

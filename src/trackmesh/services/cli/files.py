@@ -1,0 +1,153 @@
+"""Commands that need no network: track, score, plot, convert, schema."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import typer
+from rich.table import Table
+
+from trackmesh.protocol.errors import TrackmeshError
+from trackmesh.protocol.files import RecordWriter, read_records
+from trackmesh.protocol.messages import MESSAGES, Message, TrackFrame, TruthFrame
+from trackmesh.services.cli.options import AsJson, Config, err, out, told
+from trackmesh.services.cli.progress import progress_bar
+
+M = TypeVar("M", bound=Message)
+
+Tracks = Annotated[Path, typer.Argument(help="TRACKS.jsonl")]
+
+convert = typer.Typer(help="Turn a recording in another format into PLOTS.jsonl.", no_args_is_help=True)
+
+
+def records_of(path: Path, kind: type[M]) -> Iterator[M]:
+    """The records of a file that must all be of one kind."""
+    for record in read_records(path, kind):
+        assert isinstance(record, kind)
+        yield record
+
+
+@told
+def track(
+    plots: Annotated[Path, typer.Argument(help="PLOTS.jsonl, or a black box.")],
+    out_path: Annotated[Path, typer.Option("--out", help="TRACKS.jsonl to write.")],
+    config: Config = None,
+) -> None:
+    """Run the fusion engine over a recording, without a network: the same frames as live."""
+    from trackmesh.services.fusion.offline import OfflineRun
+    from trackmesh.services.fusion.settings import FusionSettings
+
+    settings = FusionSettings.load(config)
+    run = OfflineRun(settings.engine, settings.unit_id, settings.unit_number, settings.origin)
+    count, started_s = 0, time.process_time()
+    with RecordWriter(out_path) as file, progress_bar("tracking", _lines(plots)) as advance:
+        for frame in run.frames(_counted(read_records(plots), advance)):
+            file.write(frame)
+            count += 1
+    spent_s = time.process_time() - started_s
+    refused = ", ".join(f"{n} refused: {reason}" for reason, n in sorted(run.refused.items()))
+    err.print(
+        f"{count} frames of {run.plots} plots in {out_path}, {spent_s:.1f} s of CPU{'; ' + refused if refused else ''}",
+        highlight=False,
+    )
+
+
+def _counted(records: Iterator[Message], advance: Callable[[float], None]) -> Iterator[Message]:
+    for number, record in enumerate(records):
+        yield record
+        advance(number)
+
+
+def _lines(path: Path) -> int | None:
+    if not err.is_terminal:
+        return None
+    try:
+        with path.open("rb") as file:
+            return sum(1 for _ in file)
+    except OSError:
+        return None
+
+
+@told
+def score(
+    tracks: Tracks,
+    truth: Annotated[Path, typer.Argument(help="TRUTH.jsonl")],
+    as_json: AsJson = False,
+    c_m: Annotated[float, typer.Option("--c", help="Cut-off distance of GOSPA and OSPA, metres.")] = 1000.0,
+    warmup_s: Annotated[float, typer.Option("--warmup", help="Seconds not scored at the start.")] = 40.0,
+    nearest: Annotated[
+        bool, typer.Option("--nearest", help="Score the nearest track of each target: for truth of some targets only.")
+    ] = False,
+) -> None:
+    """Score tracks against the truth: GOSPA, OSPA, RMSE, NEES, identity switches."""
+    from trackmesh.sim.scoring import score_nearest, score_tracks
+
+    if nearest:
+        figures = score_nearest(records_of(tracks, TrackFrame), records_of(truth, TruthFrame), c_m).as_dict()
+    else:
+        with progress_bar("scoring", _lines(tracks)) as advance:
+            summary = score_tracks(
+                records_of(tracks, TrackFrame), records_of(truth, TruthFrame), c_m, warmup_s, advance
+            )
+        figures = summary.as_dict()
+    if as_json:
+        print(json.dumps(figures))
+        return
+    table = Table("figure", "value", title=f"{tracks} against {truth}", title_justify="left")
+    for name, value in figures.items():
+        table.add_row(name, f"{value:.4g}")
+    out.print(table)
+
+
+@told
+def plot(
+    tracks: Tracks,
+    truth: Annotated[Path | None, typer.Argument(help="TRUTH.jsonl")] = None,
+    out_path: Annotated[Path, typer.Option("--out", help="Picture to write: .png, .svg or .pdf.")] = Path("tracks.png"),
+    plots: Annotated[Path | None, typer.Option("--plots", help="PLOTS.jsonl, drawn as dots.")] = None,
+    title: Annotated[str | None, typer.Option("--title")] = None,
+) -> None:
+    """Draw tracks over the truth."""
+    from trackmesh.sim.drawing import draw_tracks
+
+    draw_tracks(
+        records_of(tracks, TrackFrame),
+        records_of(truth, TruthFrame) if truth else None,
+        read_records(plots) if plots else None,
+        out=out_path,
+        title=title,
+    )
+    err.print(f"picture in {out_path}", highlight=False)
+
+
+@convert.command("autoferry")
+@told
+def convert_autoferry(
+    detections: Annotated[
+        Path, typer.Argument(help="scenarioN_detections.json; scenarioN_groundTruth.json beside it.")
+    ],
+    out_path: Annotated[Path, typer.Option("--out", help="PLOTS.jsonl to write.")],
+    truth: Annotated[Path | None, typer.Option("--truth", help="TRUTH.jsonl to write.")] = None,
+) -> None:
+    """Convert a recording of the Autoferry sensor fusion dataset: radar and lidar as two sensors."""
+    from trackmesh.sim.autoferry import convert_autoferry as work
+
+    batches, plots = work(detections, out_path, truth)
+    err.print(f"{plots} plots in {batches} batches in {out_path}", highlight=False)
+
+
+@told
+def schema(name: Annotated[str | None, typer.Argument(help="A message: PlotBatch; default: all.")] = None) -> None:
+    """Print the JSON Schema of a message, or of all of them."""
+    by_name = {kind.__name__: kind for kind in MESSAGES.values()}
+    if name is None:
+        schemas = {ident: kind.model_json_schema() for ident, kind in MESSAGES.items()}
+        print(json.dumps(schemas, indent=2))
+        return
+    if name not in by_name:
+        raise TrackmeshError(f"There is no message {name!r}; there are {', '.join(by_name)}.")
+    print(json.dumps(by_name[name].model_json_schema(), indent=2))

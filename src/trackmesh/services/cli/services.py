@@ -1,0 +1,193 @@
+"""Commands that are one process of a deployment: router, fusion, emi, and simulated sensors."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from trackmesh.services.cli.options import Config, Connect, LogFormat, LogLevel, Realm, UnitId, told
+from trackmesh.services.runtime import ServiceRuntime, ServiceSettings
+
+Scenario = Annotated[str, typer.Option("--scenario", help="A scenario's name, or a TOML file.")]
+Seed = Annotated[int, typer.Option("--seed", help="Everything random follows from it.")]
+StartNs = Annotated[
+    int | None, typer.Option("--start-ns", help="When the scenario began, UTC ns; default: now. One world, one start.")
+]
+
+sim = typer.Typer(help="Simulated sensors, publishing in real time.", no_args_is_help=True)
+
+
+def _given(**flags: object) -> dict[str, Any]:
+    return {name: value for name, value in flags.items() if value is not None}
+
+
+@told
+def router(
+    listen: Annotated[str | None, typer.Option("--listen", help="Endpoints: tcp/0.0.0.0:7447.")] = None,
+    config: Annotated[Path | None, typer.Option("--config", help="JSON5 file, as zenohd reads it.")] = None,
+    log_level: LogLevel = None,
+    log_format: LogFormat = None,
+) -> None:
+    """Run a Zenoh router in this process, where there is no zenohd."""
+    from trackmesh.services.router import serve
+
+    settings = ServiceSettings.load(None, _given(log_level=log_level, log_format=log_format))
+    raise typer.Exit(serve(listen.split(",") if listen else [], config, settings.log_level, settings.log_format))
+
+
+@told
+def fusion(
+    config: Config = None,
+    connect: Connect = None,
+    realm: Realm = None,
+    unit_id: UnitId = None,
+    unit_number: Annotated[int | None, typer.Option("--unit-number", help="Unique in the realm, 0 to 4095.")] = None,
+    clock: Annotated[str | None, typer.Option("--clock", help="wall, or data for replayed recordings.")] = None,
+    black_box: Annotated[Path | None, typer.Option("--black-box", help="Record the engine's inputs here.")] = None,
+    log_level: LogLevel = None,
+    log_format: LogFormat = None,
+) -> None:
+    """Run a fusion unit: plots in, tracks out."""
+    from trackmesh.services.fusion.service import run
+    from trackmesh.services.fusion.settings import FusionSettings
+
+    flags = _given(
+        connect=connect, realm=realm, unit_id=unit_id, unit_number=unit_number, clock=clock, black_box=black_box,
+        log_level=log_level, log_format=log_format,
+    )  # fmt: skip
+    raise typer.Exit(run(FusionSettings.load(config, flags)))
+
+
+@told
+def emi(
+    config: Config = None,
+    connect: Connect = None,
+    realm: Realm = None,
+    unit_id: UnitId = None,
+    workers: Annotated[int | None, typer.Option("--workers", help="Requests answered at a time.")] = None,
+    log_level: LogLevel = None,
+    log_format: LogFormat = None,
+) -> None:
+    """Run an EMI service: batches of induction scans in, targets out."""
+    from trackmesh.services.emi.service import main
+    from trackmesh.services.emi.settings import EmiSettings
+
+    flags = _given(
+        connect=connect, realm=realm, unit_id=unit_id, workers=workers, log_level=log_level, log_format=log_format
+    )
+    raise typer.Exit(main(EmiSettings.load(config, flags)))
+
+
+def _run_simulator(kind: str, ident: str, flags: dict[str, Any], config: Path | None, work: Any) -> None:
+    settings = ServiceSettings.load(config, flags | {"unit_id": ident})
+
+    def start(runtime: ServiceRuntime) -> None:
+        def loop() -> None:
+            work(runtime)
+            runtime.stop("the simulation has ended")
+
+        runtime.spawn(kind, loop)
+        runtime.set_state("ready")
+
+    raise typer.Exit(ServiceRuntime(kind, settings).run(start))
+
+
+@sim.command("radar")
+@told
+def sim_radar(
+    scenario: Scenario = "two-radars",
+    radar: Annotated[str | None, typer.Option("--radar", help="Which radar; default: the first.")] = None,
+    seed: Seed = 1,
+    start_ns: StartNs = None,
+    config: Config = None,
+    connect: Connect = None,
+    realm: Realm = None,
+    log_level: LogLevel = None,
+    log_format: LogFormat = None,
+) -> None:
+    """Be one rotating radar: publish its plots sector by sector as the beam turns."""
+    from trackmesh.sim.live import run_radar
+    from trackmesh.sim.scenario import load_scenario
+
+    world = load_scenario(scenario)
+    radar_id = world.radar(radar).id if radar else world.radars[0].id
+    begin_ns = start_ns or time.time_ns()
+
+    def work(runtime: ServiceRuntime) -> None:
+        run_radar(
+            runtime.bus, world, radar_id, seed, begin_ns, runtime.stopping, keys=runtime.keys, boot_id=runtime.boot_id
+        )
+
+    flags = _given(connect=connect, realm=realm, log_level=log_level, log_format=log_format)
+    _run_simulator("sim-radar", radar_id, flags, config, work)
+
+
+@sim.command("truth")
+@told
+def sim_truth(
+    scenario: Scenario = "two-radars",
+    seed: Seed = 1,
+    start_ns: StartNs = None,
+    config: Config = None,
+    connect: Connect = None,
+    realm: Realm = None,
+    log_level: LogLevel = None,
+    log_format: LogFormat = None,
+) -> None:
+    """Publish where the simulated targets really are, for scoring."""
+    from trackmesh.sim.live import run_truth
+    from trackmesh.sim.scenario import load_scenario
+
+    world, begin_ns = load_scenario(scenario), start_ns or time.time_ns()
+
+    def work(runtime: ServiceRuntime) -> None:
+        run_truth(runtime.bus, world, seed, begin_ns, runtime.stopping, keys=runtime.keys)
+
+    flags = _given(connect=connect, realm=realm, log_level=log_level, log_format=log_format)
+    _run_simulator("sim-truth", world.name, flags, config, work)
+
+
+@sim.command("record")
+@told
+def sim_record(
+    plots: Annotated[Path, typer.Argument(help="PLOTS.jsonl to write.")],
+    truth: Annotated[Path | None, typer.Argument(help="TRUTH.jsonl to write.")] = None,
+    scenario: Scenario = "two-radars",
+    seed: Seed = 1,
+    seconds: Annotated[float | None, typer.Option("--seconds", help="How much of the scenario.")] = None,
+) -> None:
+    """Write what the sensors of a scenario would send to a file, faster than it happens."""
+    from trackmesh.services.cli.options import err
+    from trackmesh.services.cli.progress import progress_bar
+    from trackmesh.sim.recording import write_recording
+    from trackmesh.sim.scenario import load_scenario
+
+    world = load_scenario(scenario)
+    with progress_bar("recording", seconds or world.duration_s) as advance:
+        count = write_recording(world, seed, plots, truth, duration_s=seconds, progress=advance)
+    err.print(f"{count} plots of {world.name}, seed {seed}, in {plots}", highlight=False)
+
+
+@sim.command("emi")
+@told
+def sim_emi(
+    scans: Annotated[Path, typer.Argument(help="SCANS.jsonl to write.")],
+    scenario: Scenario = "two-radars",
+    seed: Seed = 1,
+) -> None:
+    """Write a batch of simulated induction scans of the targets buried in a scenario."""
+    from trackmesh.protocol.files import RecordWriter
+    from trackmesh.services.cli.options import err
+    from trackmesh.sim.emi import scenario_scans
+    from trackmesh.sim.scenario import ScenarioError, load_scenario
+
+    world = load_scenario(scenario)
+    if world.emi is None:
+        raise ScenarioError(f"The scenario {world.name!r} has no [emi] section.")
+    simulated = scenario_scans(world.emi, seed)
+    with RecordWriter(scans) as file:
+        file.write(simulated.batch)
+    err.print(f"{len(simulated.batch.field)} scans in {scans}", highlight=False)

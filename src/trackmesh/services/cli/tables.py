@@ -1,0 +1,121 @@
+"""Tables for people: tracks, sensors, services."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable, Sequence
+
+from rich.table import Table
+
+from trackmesh.protocol.messages import SensorInfo, ServiceStatus, TrackFrame
+
+STATUS_NAMES = ("tentative", "confirmed", "coasting", "ended")
+
+
+def track_table(frames: Sequence[TrackFrame], most: int = 40) -> Table:
+    """One row a track: where it is, how it moves, how well that is known."""
+    total = sum(len(f.track_id) for f in frames)
+    shown = f", the first {most}" if total > most else ""
+    table = Table(title=f"{total} tracks{shown}", title_justify="left")
+    for name in (
+        "unit",
+        "track",
+        "status",
+        "east km",
+        "north km",
+        "speed m/s",
+        "course",
+        "1 sigma m",
+        "age s",
+        "sensors",
+    ):
+        table.add_column(name, justify="left" if name in ("unit", "status", "sensors") else "right")
+    rows = ((frame, row) for frame in frames for row in range(len(frame.track_id)))
+    for _, (frame, row) in zip(range(most), rows, strict=False):
+        table.add_row(*_track_row(frame, row))
+    return table
+
+
+def _track_row(frame: TrackFrame, row: int) -> list[str]:
+    east, north, veast, vnorth = frame.state[row, :4].tolist()
+    sigma = math.sqrt(max(float(frame.covariance[row, 0] + frame.covariance[row, 6]), 0.0))
+    members = [s for s, m in zip(frame.sensors, frame.members[row].tolist(), strict=True) if m >= 0]
+    return [
+        frame.unit_id,
+        str(int(frame.track_id[row])),
+        STATUS_NAMES[int(frame.status[row])],
+        f"{east / 1e3:.2f}",
+        f"{north / 1e3:.2f}",
+        f"{math.hypot(veast, vnorth):.0f}",
+        f"{math.degrees(math.atan2(veast, vnorth)) % 360:03.0f}",
+        f"{sigma:.0f}",
+        f"{(frame.t_ns - int(frame.updated_t_ns[row])) / 1e9:.1f}",
+        ", ".join(members),
+    ]
+
+
+def sensor_table(sensors: Iterable[SensorInfo], alive: set[str]) -> Table:
+    """One row a sensor."""
+    table = Table(title="Sensors", title_justify="left")
+    for name in ("sensor", "alive", "kind", "site", "period s", "range km", "P detect", "sigma"):
+        table.add_column(name)
+    for s in sensors:
+        site = "-"
+        if s.site is not None:
+            site = f"{s.site.latitude_deg:.4f}, {s.site.longitude_deg:.4f}"
+        elif s.site_enu_m is not None:
+            site = f"{s.site_enu_m[0] / 1e3:.1f} km E, {s.site_enu_m[1] / 1e3:.1f} km N"
+        sigma = ", ".join(f"{name} {value:g}" for name, value in s.sigma.items())
+        alive_word = "yes" if s.sensor_id in alive else "no"
+        table.add_row(
+            s.sensor_id,
+            alive_word,
+            s.kind,
+            site,
+            f"{s.period_s:g}",
+            f"{s.max_range_m / 1e3:g}",
+            f"{s.p_detect:g}",
+            sigma,
+        )
+    return table
+
+
+def status_table(statuses: Iterable[ServiceStatus]) -> Table:
+    """One row a service, and below it one a sensor it hears."""
+    table = Table(title="Services", title_justify="left")
+    for name in (
+        "service",
+        "unit",
+        "state",
+        "up s",
+        "tracks",
+        "counted",
+        "refused",
+        "latency ms p50 / p99",
+        "told s ago",
+    ):
+        table.add_column(name)
+    now_ns = time.time_ns()
+    for s in statuses:
+        latency = f"{s.latency_ms['p50']:.1f} / {s.latency_ms['p99']:.1f}" if s.latency_ms else "-"
+        table.add_row(
+            s.kind,
+            s.unit_id,
+            s.state,
+            f"{s.uptime_s:.0f}",
+            f"{s.figures['tracks']:.0f}" if "tracks" in s.figures else "-",
+            _pairs(s.counters),
+            _pairs(s.refused),
+            latency,
+            f"{(now_ns - s.t_ns) / 1e9:.1f}",
+        )
+        for sensor in s.sensors:
+            life = "alive" if sensor.alive else "gone"
+            counted = f"{sensor.plots} plots, {sensor.batches} batches, {sensor.gaps} missing, {sensor.refused} refused"
+            table.add_row(f"  {sensor.sensor_id}", "", life, "", "", counted, "", "", "")
+    return table
+
+
+def _pairs(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {n}" for name, n in sorted(counts.items())) or "-"

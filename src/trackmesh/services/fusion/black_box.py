@@ -1,0 +1,47 @@
+"""The black box: all inputs of the engine, in the order in which it took them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from trackmesh.protocol.files import RecordWriter, Tick, UnitRecord
+from trackmesh.protocol.messages import Geodetic, PlotBatch, SensorInfo
+from trackmesh.services.fusion.engine import Unit
+from trackmesh.services.fusion.settings import EngineSettings
+
+
+def unit_record(unit: Unit, settings: EngineSettings) -> UnitRecord:
+    """The first line of a black box."""
+    return UnitRecord(
+        unit_id=unit.unit_id,
+        unit_number=unit.number,
+        boot_id=unit.boot_id,
+        first_track_number=unit.first_track,
+        settings=settings.model_dump(mode="json"),
+    )
+
+
+class BlackBox:
+    """Writes a file that ``trackmesh track`` turns into exactly the frames that were published.
+
+    Raises:
+        TrackmeshError: the file cannot be written.
+    """
+
+    def __init__(self, path: Path, unit: Unit, settings: EngineSettings, origin: Geodetic | None) -> None:
+        self._writer = RecordWriter(path)
+        self._writer.write(unit_record(unit, settings))
+        if origin is not None:
+            self._writer.write(origin)
+
+    def take(self, record: SensorInfo | PlotBatch) -> None:
+        """Record an input."""
+        self._writer.write(record)
+
+    def tick(self, t_ns: int) -> None:
+        """Record a tick."""
+        self._writer.write(Tick(t_ns=t_ns))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._writer.close()

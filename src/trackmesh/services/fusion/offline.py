@@ -1,0 +1,90 @@
+"""The engine without a network: a recording, or a black box, to frames."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+
+from pydantic import ValidationError
+
+from trackmesh.protocol.errors import RefusedMessage, TrackmeshError
+from trackmesh.protocol.files import Tick, UnitRecord
+from trackmesh.protocol.messages import Geodetic, Message, PlotBatch, SensorInfo, TrackFrame
+from trackmesh.services.fusion.engine import FusionEngine, Unit
+from trackmesh.services.fusion.intake import Intake
+from trackmesh.services.fusion.settings import EngineSettings
+
+
+class OfflineRun:
+    """One pass over the records of a file.
+
+    A black box names unit and settings itself; any other recording is tracked by ``settings``.
+
+    Attributes:
+        refused: batches refused, by reason.
+        plots: plots taken.
+    """
+
+    def __init__(
+        self,
+        settings: EngineSettings,
+        unit_id: str = "offline",
+        unit_number: int = 0,
+        origin: Geodetic | None = None,
+    ) -> None:
+        self._settings = settings
+        self._unit = Unit(unit_id, unit_number)
+        self._origin = origin
+        self._intake = Intake(0, 0)
+        self.engine: FusionEngine | None = None
+        self.refused: Counter[str] = Counter()
+        self.plots = 0
+
+    def frames(self, records: Iterable[Message]) -> Iterator[TrackFrame]:
+        """The frames that the records give, in order.
+
+        Raises:
+            TrackmeshError: a record is not one of an input, or the settings of a black box are not of this version.
+        """
+        for record in records:
+            frame = self._take(record)
+            if frame is not None:
+                yield frame
+
+    def _take(self, record: Message) -> TrackFrame | None:
+        if isinstance(record, UnitRecord):
+            self._begin(record)
+        elif isinstance(record, Geodetic):
+            self._origin = record
+        elif isinstance(record, SensorInfo):
+            self._running().sensor(record)
+        elif isinstance(record, Tick):
+            return self._running().tick(record.t_ns)
+        elif isinstance(record, PlotBatch):
+            return self._plots(record)
+        else:
+            raise TrackmeshError(f"A {type(record).__name__} is no input of the tracker.")
+        return None
+
+    def _plots(self, batch: PlotBatch) -> TrackFrame | None:
+        engine = self._running()
+        try:
+            self._intake.check(batch, None)
+            frame = engine.plots(batch)
+        except RefusedMessage as error:
+            self.refused[error.reason] += 1
+            return None
+        self.plots += len(batch.t_ns)
+        return frame
+
+    def _begin(self, record: UnitRecord) -> None:
+        try:
+            self._settings = EngineSettings.model_validate(record.settings)
+        except ValidationError:
+            raise TrackmeshError("The black box was recorded with settings of another version of trackmesh.") from None
+        self._unit = Unit(record.unit_id, record.unit_number, record.boot_id, record.first_track_number)
+
+    def _running(self) -> FusionEngine:
+        if self.engine is None:
+            self.engine = FusionEngine(self._settings, self._unit, self._origin)
+        return self.engine

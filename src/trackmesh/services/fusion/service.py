@@ -1,0 +1,227 @@
+"""The fusion service: plots from the bus, the engine, pictures to the bus. One thread owns the engine."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+
+from trackmesh.protocol.bus import Query, Sample
+from trackmesh.protocol.codec import decode, encode, encoding, open_envelope
+from trackmesh.protocol.errors import QueryFailed, RefusedMessage
+from trackmesh.protocol.keys import kind_and_id, last_chunk
+from trackmesh.protocol.messages import PlotBatch, SensorHealth, SensorInfo, TrackFrame, TrackQuery
+from trackmesh.protocol.serving import answers
+from trackmesh.services.fusion.black_box import BlackBox
+from trackmesh.services.fusion.engine import TRACK_EPOCH_MS, FusionEngine, Unit
+from trackmesh.services.fusion.intake import Intake
+from trackmesh.services.fusion.settings import FusionSettings
+from trackmesh.services.fusion.warm_up import warm_up
+from trackmesh.services.runtime import Health, ServiceRuntime
+
+KIND = "fusion"
+_FRAMES_KEPT = 16
+_PLOTS_WAITING = 4096
+_BATCHES_HELD = 64
+_ASK_AGAIN_S = 2.0
+
+
+class FusionService:
+    """A unit at work on a runtime; ``start`` declares everything, the runtime stops it."""
+
+    def __init__(self, runtime: ServiceRuntime, settings: FusionSettings) -> None:
+        self.runtime = runtime
+        self.settings = settings
+        first = time.time_ns() // 1_000_000 - TRACK_EPOCH_MS
+        self.unit = Unit(settings.unit_id, settings.unit_number, runtime.boot_id, first)
+        self.engine = FusionEngine(settings.engine, self.unit, settings.origin)
+        self.intake = Intake(int(settings.max_age_s * 1e9), int(settings.max_ahead_s * 1e9))
+        self._lock = threading.Lock()
+        self._alive: set[str] = set()
+        self._held: dict[str, deque[PlotBatch]] = {}
+        self._asked_s: dict[str, float] = {}
+        self._tick_due_s = 0.0
+        self._black_box: BlackBox | None = None
+
+    def start(self) -> None:
+        """Compile, subscribe, serve, and be ready."""
+        runtime, keys = self.runtime, self.runtime.keys
+        runtime.health = self.health
+        if self.settings.black_box is not None:
+            self._black_box = BlackBox(self.settings.black_box, self.unit, self.settings.engine, self.settings.origin)
+            runtime.on_exit(self._black_box.close)
+        runtime.set_state("compiling")
+        started = time.monotonic()
+        warm_up(self.settings.engine)
+        runtime.log.info("kernels ready after %.1f s", time.monotonic() - started)
+        self._frames = runtime.closing(runtime.bus.publisher(keys.tracks(self.unit.unit_id), history=_FRAMES_KEPT))
+        self._tokens = runtime.closing(runtime.bus.watch_alive(keys.live("*", "*")))
+        self._infos = runtime.closing(runtime.bus.subscribe(keys.sensor("*"), history=True))
+        self._plots = runtime.closing(runtime.bus.subscribe(keys.plots("*"), history=True, capacity=_PLOTS_WAITING))
+        runtime.closing(runtime.bus.serve(keys.service("tracks", self.unit.unit_id), self.answer))
+        runtime.spawn("engine", self._run)
+        runtime.set_state("ready")
+
+    def answer(self, query: Query) -> Iterator[tuple[bytes, str]]:
+        """Answer a ``TrackQuery`` with one ``TrackFrame``; an empty payload asks for all tracks."""
+
+        def frames(asked: TrackQuery) -> Iterator[TrackFrame]:
+            self.runtime.counters.count("queries")
+            with self._lock:
+                frame = self.engine.query(asked)
+            yield frame
+
+        return answers(query, TrackQuery, frames, self.runtime.counters.refuse)
+
+    def health(self) -> Health:
+        """Sensors and figures for the status."""
+        with self._lock:
+            figures = self.engine.figures()
+            counters = dict(self.engine.counters)
+            sensors = [self._sensor_health(sensor_id) for sensor_id in sorted(self.intake.streams)]
+        figures |= {f"engine.{name}": float(value) for name, value in counters.items()}
+        figures["plots_dropped_here"] = float(self._dropped())
+        return Health(figures, sensors)
+
+    # --- the engine's thread ---
+
+    def _run(self) -> None:
+        while not self.runtime.stopping.is_set():
+            self._drain()
+            sample = self._plots.receive(timeout_s=self.settings.tick_s)
+            if sample is not None:
+                self._on_plots(sample)
+            self._tick_if_due()
+
+    def _drain(self) -> None:
+        while (event := self._tokens.receive(timeout_s=0)) is not None:
+            kind, ident = kind_and_id(event.key)
+            if kind == "sensor":
+                (self._alive.add if event.alive else self._alive.discard)(ident)
+                self.runtime.log.info("sensor %s %s", ident, "is there" if event.alive else "is gone")
+        while (sample := self._infos.receive(timeout_s=0)) is not None:
+            self._on_info(sample)
+
+    def _on_info(self, sample: Sample) -> None:
+        try:
+            info = decode(sample.payload, SensorInfo, sample.encoding)
+            if info.sensor_id != last_chunk(sample.key):
+                raise RefusedMessage("wrong_sensor", f"{sample.key} brought the sensor {info.sensor_id}.")
+        except RefusedMessage as error:
+            self._refuse(last_chunk(sample.key), error)
+            return
+        self._take_info(info)
+
+    def _take_info(self, info: SensorInfo) -> None:
+        known = self.engine.sensors.get(info.sensor_id)
+        if known is None or known.info != info:
+            if self._black_box:
+                self._black_box.take(info)
+            with self._lock:
+                self.engine.sensor(info)
+            self.runtime.log.info("sensor %s: %s, every %g s", info.sensor_id, info.kind, info.period_s)
+        for batch in self._held.pop(info.sensor_id, ()):
+            self._take_batch(batch)
+
+    def _on_plots(self, sample: Sample) -> None:
+        sensor_id = last_chunk(sample.key)
+        try:
+            batch = decode(sample.payload, PlotBatch, sample.encoding, self.settings.max_batch_bytes)
+            if batch.sensor_id != sensor_id:
+                raise RefusedMessage("wrong_sensor", f"{sample.key} brought plots of {batch.sensor_id}.")
+            now_ns = time.time_ns() if self.settings.clock == "wall" else None
+            self.intake.check(batch, now_ns)
+        except RefusedMessage as error:
+            self._refuse(sensor_id, error)
+            return
+        if sensor_id in self.engine.sensors:
+            self._take_batch(batch)
+        else:
+            self._hold(batch)
+
+    def _take_batch(self, batch: PlotBatch) -> None:
+        if self._black_box:
+            self._black_box.take(batch)
+        try:
+            with self._lock:
+                frame = self.engine.plots(batch)
+        except RefusedMessage as error:
+            self._refuse(batch.sensor_id, error)
+            return
+        self._tick_due_s = time.monotonic() + self.settings.tick_s
+        self.runtime.counters.count("batches")
+        self.runtime.counters.count("plots", len(batch.t_ns))
+        self._publish(frame)
+        if frame is not None and len(batch.t_ns) and self.settings.clock == "wall":
+            self.runtime.latencies.record((time.time_ns() - int(batch.t_ns.max())) / 1e9)
+
+    def _tick_if_due(self) -> None:
+        if self.settings.clock != "wall" or time.monotonic() < self._tick_due_s:
+            return
+        self._tick_due_s = time.monotonic() + self.settings.tick_s
+        t_ns = time.time_ns()
+        if self._black_box:
+            self._black_box.tick(t_ns)
+        with self._lock:
+            frame = self.engine.tick(t_ns)
+        self._publish(frame)
+
+    def _publish(self, frame: TrackFrame | None) -> None:
+        if frame is not None:
+            self._frames.put(encode(frame), encoding(frame))
+            self.runtime.counters.count("frames")
+
+    # --- sensors not yet known ---
+
+    def _hold(self, batch: PlotBatch) -> None:
+        """Keep the plots of a sensor of which nothing is known yet, and ask it who it is."""
+        held = self._held.setdefault(batch.sensor_id, deque())
+        held.append(batch)
+        if len(held) > _BATCHES_HELD:
+            held.popleft()
+            detail = f"Nothing is known of sensor {batch.sensor_id}: it must publish its SensorInfo."
+            self._refuse(batch.sensor_id, RefusedMessage("unknown_sensor", detail))
+        now_s = time.monotonic()
+        if now_s - self._asked_s.get(batch.sensor_id, -_ASK_AGAIN_S) < _ASK_AGAIN_S:
+            return
+        self._asked_s[batch.sensor_id] = now_s
+        for reply in self.runtime.bus.query(self.runtime.keys.sensor(batch.sensor_id), timeout_s=0.5):
+            try:
+                info = open_envelope(reply.payload, reply.encoding, SensorInfo)
+            except (RefusedMessage, QueryFailed) as error:
+                self.runtime.log.warning("sensor %s gave no information: %s", batch.sensor_id, error)
+                continue
+            if isinstance(info, SensorInfo) and info.sensor_id == batch.sensor_id:
+                self._take_info(info)
+
+    # --- counting ---
+
+    def _refuse(self, sensor_id: str, error: RefusedMessage) -> None:
+        self.runtime.counters.refuse(error.reason)
+        if sensor_id in self.intake.streams or sensor_id in self.engine.sensors:
+            self.intake.stream(sensor_id).refused += 1
+        self.runtime.log.debug("refused: %s", error)
+
+    def _sensor_health(self, sensor_id: str) -> SensorHealth:
+        stream, sensor = self.intake.streams[sensor_id], self.engine.sensors.get(sensor_id)
+        return SensorHealth(
+            sensor_id=sensor_id,
+            alive=sensor_id in self._alive,
+            plots=stream.plots,
+            batches=stream.batches,
+            gaps=stream.gaps,
+            duplicates=stream.duplicates,
+            refused=stream.refused,
+            last_seq=max(stream.seq, 0),
+            last_t_ns=stream.last_t_ns,
+            clutter_density=sensor.system_clutter.value(0, 1.0) if sensor else None,
+        )
+
+    def _dropped(self) -> int:
+        return int(getattr(self._plots, "dropped", 0))
+
+
+def run(settings: FusionSettings) -> int:
+    """Be a fusion service until told to stop; the exit code."""
+    return ServiceRuntime(KIND, settings).run(lambda runtime: FusionService(runtime, settings).start())

@@ -1,0 +1,1 @@
+"""Simulated worlds: truth, sensors, recordings, scores and pictures."""

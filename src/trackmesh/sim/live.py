@@ -1,0 +1,123 @@
+"""Simulated sensors in real time: a radar and the truth, published as they happen.
+
+Every instant is counted from ``start_ns``, the moment at which the scenario began, so that nothing drifts and
+processes that share scenario, seed and start show one world.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+
+from trackmesh.protocol.bus import Bus, Query
+from trackmesh.protocol.codec import Format, answer, encode, encoding, end
+from trackmesh.protocol.keys import Keys
+from trackmesh.protocol.messages import Envelope, SensorInfo
+from trackmesh.sim.radar import radar_batches, sensor_info
+from trackmesh.sim.recording import TRUTH_PERIOD_S
+from trackmesh.sim.scenario import Scenario
+from trackmesh.sim.truth import World, truth_frame
+
+LONGEST_WAIT_S = 1.0
+"""The wall clock may be set while we wait; it is looked at again after this time."""
+
+PLOT_HISTORY_TURNS = 2
+
+Clock = Callable[[], int]
+
+
+def run_radar(
+    bus: Bus,
+    scenario: Scenario,
+    radar_id: str,
+    seed: int,
+    start_ns: int,
+    stop: threading.Event,
+    *,
+    keys: Keys | None = None,
+    boot_id: str | None = None,
+    clock: Clock = time.time_ns,
+) -> int:
+    """Publish a radar's sectors, each when the beam has left it, until ``stop`` is set; returns how many.
+
+    It begins with the sector that the beam is in now. Who fell behind by more than a turn, such as a machine that
+    slept, goes on with the present and does not send what is past.
+
+    Raises:
+        ScenarioError: the scenario has no such radar.
+    """
+    radar, keys = scenario.radar(radar_id), keys or Keys()
+    world, boot_id, sent = World(scenario, seed), boot_id or uuid.uuid4().hex, 0
+    with _Announced(bus, keys, sensor_info(scenario, radar)):
+        publisher = bus.publisher(keys.plots(radar.id), history=PLOT_HISTORY_TURNS * radar.sectors)
+        while not stop.is_set():
+            after_s = max(0.0, (clock() - start_ns) * 1e-9)
+            batches = radar_batches(world, radar, boot_id=boot_id, start_ns=start_ns, after_s=after_s, first_seq=sent)
+            for due_ns, batch in batches:
+                if not wait_until(due_ns, stop, clock) or clock() - due_ns > radar.period_s * 1e9:
+                    break
+                publisher.put(encode(batch), encoding(batch))
+                sent += 1
+        publisher.close()
+    return sent
+
+
+def run_truth(
+    bus: Bus,
+    scenario: Scenario,
+    seed: int,
+    start_ns: int,
+    stop: threading.Event,
+    *,
+    keys: Keys | None = None,
+    period_s: float = TRUTH_PERIOD_S,
+    clock: Clock = time.time_ns,
+) -> int:
+    """Publish the truth every ``period_s`` until ``stop`` is set, leaving out what is past; returns how many frames."""
+    world, sent = World(scenario, seed), 0
+    publisher = bus.publisher((keys or Keys()).truth(scenario.name))
+    period_ns = round(period_s * 1e9)
+    k = max(0, -((start_ns - clock()) // period_ns))
+    while wait_until(start_ns + k * period_ns, stop, clock):
+        frame = truth_frame(world, k * period_s, start_ns)
+        publisher.put(encode(frame), encoding(frame))
+        sent += 1
+        k = max(k + 1, (clock() - start_ns) // period_ns)
+    publisher.close()
+    return sent
+
+
+def wait_until(due_ns: int, stop: threading.Event, clock: Clock = time.time_ns) -> bool:
+    """Wait for a time of the wall clock: True when it has come, False when ``stop`` was set first."""
+    while not stop.is_set():
+        left_s = (due_ns - clock()) * 1e-9
+        if left_s <= 0.0:
+            return True
+        stop.wait(min(left_s, LONGEST_WAIT_S))
+    return False
+
+
+class _Announced:
+    """A sensor that is alive, has said who it is, and answers who asks."""
+
+    def __init__(self, bus: Bus, keys: Keys, info: SensorInfo) -> None:
+        self._info = info
+        key = keys.sensor(info.sensor_id)
+        self._publisher = bus.publisher(key, history=1)
+        self._publisher.put(encode(info), encoding(info))
+        self._server = bus.serve(key, self._answer, workers=1)
+        self._token = bus.declare_alive(keys.live("sensor", info.sensor_id))
+
+    def _answer(self, query: Query) -> Iterator[tuple[bytes, str]]:
+        fmt: Format = "json" if query.parameters.get("fmt") == "json" else "msgpack"
+        yield answer(self._info, fmt), encoding(Envelope, fmt)
+        yield end(1, fmt), encoding(Envelope, fmt)
+
+    def __enter__(self) -> _Announced:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for declared in (self._token, self._server, self._publisher):
+            declared.close()

@@ -1,0 +1,69 @@
+"""Small participants, each a process of its own: ``python -m tests.network.peers ROLE ENDPOINTS KEY [N]``.
+
+``publish`` counts at 200 Hz, keeping N messages, and prints how far it is; ``token`` is alive; ``listen`` subscribes in
+all ways and serves; ``count`` answers a query with N numbers, and dies after half of them if asked to.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+from trackmesh.protocol.bus import Query
+from trackmesh.protocol.zenoh_bus import ZenohBus
+from trackmesh.services.process import on_signal
+
+
+def publish(bus: ZenohBus, key: str, history: int, stop: threading.Event) -> None:
+    publisher = bus.publisher(key, history=history)
+    number = 0
+    while not stop.wait(0.005):
+        publisher.put(str(number).encode(), "text/plain")
+        print(f"at {number}", flush=True)
+        number += 1
+
+
+def token(bus: ZenohBus, key: str, _n: int, stop: threading.Event) -> None:
+    bus.declare_alive(key)
+    stop.wait()
+
+
+def listen(bus: ZenohBus, key: str, _n: int, stop: threading.Event) -> None:
+    plain, kept, watcher = bus.subscribe(key), bus.subscribe(key, history=True), bus.watch_alive(key)
+    bus.serve(key, lambda _query: [(b"", "")])
+    threads = [threading.Thread(target=list, args=(s,)) for s in (plain, kept, watcher)]
+    for thread in threads:
+        thread.start()
+    print("listening", flush=True)
+    stop.wait()
+    for subscription in (plain, kept, watcher):
+        subscription.close()
+    for thread in threads:
+        thread.join()
+
+
+def count(bus: ZenohBus, key: str, n: int, stop: threading.Event) -> None:
+    def handler(query: Query) -> Iterator[tuple[bytes, str]]:
+        for i in range(n):
+            yield str(i).encode(), "text/plain"
+            if query.payload == b"die" and i == n // 2:
+                time.sleep(0.2)
+                os._exit(9)
+
+    bus.serve(key, handler)
+    stop.wait()
+
+
+def main(role: str, endpoints: str, key: str, n: int) -> None:
+    stop = threading.Event()
+    with on_signal(lambda _name: stop.set()), ZenohBus.open(endpoints.split(",")) as bus:
+        print("ready", flush=True)
+        {"publish": publish, "token": token, "listen": listen, "count": count}[role](bus, key, n, stop)
+    print("left", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2], sys.argv[3], int(sys.argv[4]) if len(sys.argv) > 4 else 0)
