@@ -1,7 +1,8 @@
 """Small participants, each a process of its own: ``python -m tests.network.peers ROLE ENDPOINTS KEY [N]``.
 
-``publish`` counts at 200 Hz, keeping N messages, and prints how far it is; ``token`` is alive; ``listen`` subscribes in
-all ways and serves; ``count`` answers a query with N numbers, and dies after half of them if asked to.
+``publish`` counts at up to 400 Hz, keeping N messages, and prints how far it is; ``token`` is alive; ``listen``
+subscribes in all ways and serves; ``forget`` does so and ends without closing anything; ``count`` answers a query with
+N numbers, and dies after half of them if asked to.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from trackmesh.services.process import on_signal
 def publish(bus: ZenohBus, key: str, history: int, stop: threading.Event) -> None:
     publisher = bus.publisher(key, history=history)
     number = 0
-    while not stop.wait(0.005):
+    while not stop.wait(0.0025):
         publisher.put(str(number).encode(), "text/plain")
         print(f"at {number}", flush=True)
         number += 1
@@ -57,7 +58,19 @@ def count(bus: ZenohBus, key: str, n: int, stop: threading.Event) -> None:
     stop.wait()
 
 
+def forget(endpoints: str, key: str, error: bool) -> None:
+    bus = ZenohBus.open(endpoints.split(","))
+    bus.subscribe(key)
+    bus.subscribe(key, history=True)
+    bus.serve(key, lambda _query: [(b"", "")])
+    if error:
+        raise ZeroDivisionError
+
+
 def main(role: str, endpoints: str, key: str, n: int) -> None:
+    if role == "forget":
+        forget(endpoints, key, bool(n))
+        return
     stop = threading.Event()
     with on_signal(lambda _name: stop.set()), ZenohBus.open(endpoints.split(",")) as bus:
         print("ready", flush=True)

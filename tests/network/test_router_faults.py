@@ -14,7 +14,7 @@ from trackmesh.protocol.zenoh_bus import ZenohBus
 
 PLOTS = "faults/@v1/plots/a"
 LIVE = "faults/@v1/live/sensor/a"
-KEPT = 2000
+KEPT = 4000
 
 
 @pytest.fixture
@@ -126,7 +126,7 @@ def test_a_frozen_router_loses_nothing_of_what_is_kept(
     publisher = peer(processes, "publish", own_router.endpoint, PLOTS, KEPT)
     publish_on(publisher, 50)
     own_router.process.send(signal.SIGSTOP)
-    publish_on(publisher, 600)
+    publish_on(publisher, 1100)
     own_router.process.send(signal.SIGCONT)
     numbers = numbers_up_to(subscription, publish_on(publisher, 100))
     assert numbers[0] == 0
@@ -198,6 +198,15 @@ def test_a_process_that_listens_leaves_without_its_router(processes: Processes, 
     own_router.process.kill()
     assert process.stop() == 0
     assert "left" in process.output
+
+
+@pytest.mark.parametrize("error", [0, 1])
+def test_a_process_that_forgets_to_close_ends_all_the_same(
+    processes: Processes, own_router: RouterProcess, error: int
+) -> None:
+    process = processes.start("-m", "tests.network.peers", "forget", own_router.endpoint, PLOTS, str(error))
+    wait_until(lambda: not process.running, "the process ends")
+    assert process.stop() == error
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

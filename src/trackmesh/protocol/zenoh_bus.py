@@ -142,6 +142,37 @@ class _AliveWatcher:
         self._buffer.offer(AliveEvent(key, alive))
 
 
+class _ExitGuard:
+    """Closes what a program forgot to close: an open session with a subscriber would keep its process for ever.
+
+    ``atexit`` is too late for it, it comes after the threads of the session are waited for.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._open: set[ZenohBus] = set()
+        self._started = False
+
+    def add(self, bus: ZenohBus) -> None:
+        with self._lock:
+            self._open.add(bus)
+            if not self._started:
+                self._started = True
+                threading.Thread(target=self._wait, name="zenoh-exit").start()
+
+    def discard(self, bus: ZenohBus) -> None:
+        with self._lock:
+            self._open.discard(bus)
+
+    def _wait(self) -> None:
+        threading.main_thread().join()
+        for bus in list(self._open):
+            bus.close()
+
+
+_guard = _ExitGuard()
+
+
 class ZenohBus:
     """One participant of a Zenoh network; made by ``open``."""
 
@@ -150,6 +181,7 @@ class ZenohBus:
         self._lock = threading.Lock()
         self._declared: dict[_Declaration, None] = {}
         self._closed = False
+        _guard.add(self)
 
     @classmethod
     def open(
@@ -257,6 +289,7 @@ class ZenohBus:
             if self._closed:
                 return
             self._closed = True
+        _guard.discard(self)
         # Closing can hang on some links; whoever leaves must not.
         thread = threading.Thread(target=self._close_all, name="zenoh-close", daemon=True)
         thread.start()

@@ -36,7 +36,12 @@ _CLIENT: dict[str, object] = {
     "queries_default_timeout": 2000,
 }
 
-_ROUTER: dict[str, object] = {"mode": "router", "adminspace/enabled": True}
+_ROUTER: dict[str, object] = {
+    "mode": "router",
+    "adminspace/enabled": True,
+    # Who does not scout need not wait half a second for answers to it.
+    "scouting/delay": 0,
+}
 
 
 def client_config(endpoints: Sequence[str], path: Path | None = None) -> zenoh.Config:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +26,9 @@ LAW = settings(deadline=None, max_examples=60)
 
 MODELS = make_models(np.array([1.0, 50.0, 500.0]), np.array([50.0, 15.0, 15.0]))
 DIRICHLET = make_models(np.array([1.0, 50.0, 500.0]), np.array([50.0, 15.0, 15.0]), prior_count=20.0)
+
+SCALE = np.outer([100.0, 100.0, 10.0, 10.0], [100.0, 100.0, 10.0, 10.0])
+"""Turns a random covariance into one of metres and metres a second."""
 
 seeds = st.integers(0, 2**32 - 1)
 sojourns = st.lists(st.floats(0.5, 500.0), min_size=1, max_size=4).map(np.array)
@@ -87,7 +95,7 @@ def probabilities(rng: np.random.Generator, r: int) -> FloatArray:
 def random_track(rng: np.random.Generator, r: int) -> Track:
     """A filter in the middle of its life, its models a few hundred metres apart."""
     x = rng.normal(size=(r, 4)) * [300.0, 300.0, 20.0, 20.0]
-    P = covariances(rng, (r,), 4) * np.outer(*[[100.0, 100.0, 10.0, 10.0]] * 2)
+    P = covariances(rng, (r,), 4) * SCALE
     return Track(x, P, probabilities(rng, r), np.zeros((r, r)))
 
 
@@ -104,12 +112,13 @@ def random_walk(
 
 def flow(dt_s: float) -> FloatArray:
     """F of constant velocity."""
-    return np.kron([[1.0, dt_s], [0.0, 1.0]], np.eye(2))
+    return np.asarray(np.kron([[1.0, dt_s], [0.0, 1.0]], np.eye(2)), np.float64)
 
 
 def noise(dt_s: float, q: float) -> FloatArray:
     """Q of white-noise acceleration."""
-    return np.kron(q * np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]]), np.eye(2))
+    block = q * np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]])
+    return np.asarray(np.kron(block, np.eye(2)), np.float64)
 
 
 H = np.eye(2, 4)
@@ -157,6 +166,10 @@ def feed_row(models: Models, f: Filters, row: int, plot: Plot, sensor: int = 0) 
     return bool(taken[0])
 
 
+def copied(f: Filters) -> Filters:
+    return Filters(**{name: a.copy() for name, a in f._asdict().items()})
+
+
 def head(f: Filters, row: int = 0) -> Track:
     return Track(f.x[row], f.P[row], f.mu[row], f.counts[row]).copy()
 
@@ -167,3 +180,27 @@ def predicted(models: Models, f: Filters, rows: IntArray, t_s: FloatArray) -> tu
     out = Track(np.empty((m, r, 4)), np.empty((m, r, 4, 4)), np.empty((m, r)), np.empty(0))
     known = tracks.predict(models, f, rows, t_s, out.x, out.P, out.mu)
     return out, known
+
+
+def plain_python(expression: str, module: str) -> Any:
+    """The value of an expression over a test module's names, computed in a process in which nothing is compiled."""
+    root = str(Path(__file__).resolve().parents[3])
+    code = f"import json; from {module} import *; print(json.dumps({expression}))"
+    env = os.environ | {
+        "NUMBA_DISABLE_JIT": "1",
+        "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")]),
+    }
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def fed_walk(models: Models) -> FloatArray:
+    """Mean, covariance and model probabilities of one track after a walk with a late plot, as one row of numbers."""
+    plots = random_walk(np.random.default_rng(11), 20)
+    f = fresh_filters(models, plots[0])
+    for plot in [*plots[1:10], *plots[11:14], plots[10], *plots[14:]]:
+        feed_row(models, f, 0, plot)
+    ahead, _ = predicted(models, f, np.array([0]), f.t_s + 3.0)
+    mean, P = tracks.moments(ahead.x, ahead.P, ahead.mu)
+    return np.concatenate([mean.ravel(), P.ravel(), ahead.mu.ravel()])

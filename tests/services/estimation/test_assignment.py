@@ -81,8 +81,8 @@ def test_a_giant_component_is_solved_greedily() -> None:
     assert got.tolist() == want.tolist()
     # One small component beside it is still solved exactly: greed would take the 3 and be left with the 0.1.
     extra = np.array([n, n, n + 1, n + 1]), np.array([n, n + 1, n, n + 1]), np.array([3.0, 2.5, 2.5, 0.1])
-    both = tuple(np.concatenate(p) for p in zip(pairs, extra, strict=True))
-    got = assign(*both, n + 2, n + 2)
+    rows, columns, scores = (np.concatenate(p) for p in zip(pairs, extra, strict=True))
+    got = assign(rows, columns, scores, n + 2, n + 2)
     assert got[:n].tolist() == want.tolist()
     assert got[n:].tolist() == [n + 1, n]
 

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from tests.services.estimation.makers import (
     LAW,
     FloatArray,
-    IntArray,
     covariances,
     packed,
     seeds,
@@ -31,10 +30,9 @@ def scene(rng: np.random.Generator, n: int, m: int, r: int, span_m: float = 2000
     return x, P, mu, rng.uniform(-1.5, 1.5, n), z, packed(covariances(rng, (m,), 2, 900.0)), rng.uniform(-1.5, 1.5, m)
 
 
-def brute_force(
-    x: FloatArray, P: FloatArray, mu: FloatArray, t: FloatArray, z: FloatArray, R: FloatArray, tz: FloatArray, limit: float
-) -> dict[tuple[int, int], float]:
+def brute_force(things: Scene, limit: float) -> dict[tuple[int, int], float]:
     """Every pair inside a model's ellipse, with -2 ln of the mixture density but for its constant."""
+    x, P, mu, t, z, R, tz = things
     found = {}
     for i in range(len(x)):
         for j in range(len(z)):
@@ -51,7 +49,7 @@ def brute_force(
 @given(seeds, st.integers(1, 12), st.integers(1, 15), st.integers(1, 3), st.sampled_from([4.0, 16.0, 25.0]))
 def test_finds_exactly_the_pairs_of_brute_force(seed: int, n: int, m: int, r: int, limit: float) -> None:
     things = scene(np.random.default_rng(seed), n, m, r)
-    want = brute_force(*things, limit)
+    want = brute_force(things, limit)
     i, j, cost = gate(*things, limit)
     got = dict(zip(zip(i.tolist(), j.tolist(), strict=True), cost.tolist(), strict=True))
     assert len(got) == len(i), "a pair is listed twice"
@@ -100,8 +98,6 @@ def test_a_covariance_that_is_not_positive_is_in_no_gate() -> None:
 @pytest.mark.parametrize(("n", "m"), [(0, 3), (3, 0), (0, 0)])
 def test_nothing_on_one_side_gives_no_pairs(n: int, m: int) -> None:
     rng = np.random.default_rng(4)
-    full = scene(rng, 3, 3, 2)
-    things = (*(a[:n] for a in full[:4]), *(a[:m] for a in full[4:]))
-    i, j, cost = gate(*things, 16.0)
-    empty: IntArray = np.empty(0, np.int64)
-    assert i.tolist() == j.tolist() == cost.tolist() == empty.tolist()
+    x, P, mu, t, z, R, tz = scene(rng, 3, 3, 2)
+    i, j, cost = gate(x[:n], P[:n], mu[:n], t[:n], z[:m], R[:m], tz[:m], 16.0)
+    assert i.tolist() == j.tolist() == cost.tolist() == []

@@ -132,7 +132,7 @@ def exact_moments(branches: list[Branch], r: int) -> tuple[FloatArray, FloatArra
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     mean, covariance = mixture_moments(np.array([b.x for b in branches]), np.array([b.P for b in branches]), weight)
-    return mean, covariance, np.bincount([b.model for b in branches], weight, minlength=r)
+    return mean, covariance, weight @ np.eye(r)[[b.model for b in branches]]
 
 
 @pytest.mark.parametrize("models", [TWO_MODELS, MODELS], ids=["two", "three"])

@@ -5,7 +5,7 @@ import pytest
 import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.services.estimation.makers import LAW, FloatArray, IntArray, covariances, seeds
+from tests.services.estimation.makers import LAW, SCALE, FloatArray, IntArray, covariances, seeds
 
 from trackmesh.services.estimation.pairs import (
     PairRules,
@@ -15,7 +15,6 @@ from trackmesh.services.estimation.pairs import (
     state_distances,
 )
 
-SCALE = np.outer(*[[100.0, 100.0, 10.0, 10.0]] * 2)
 UNCLIPPED = PairRules(low=-np.inf, high=np.inf)
 
 

@@ -10,8 +10,8 @@ from tests.services.estimation.makers import (
     MODELS,
     FloatArray,
     Plot,
-    Track,
     begin_row,
+    copied,
     covariances,
     feed_row,
     filtered,
@@ -54,10 +54,10 @@ def same(one: Filters, other: Filters, row: int = 0) -> bool:
 
 def late_order(rng: np.random.Generator, n: int, reach: int) -> list[int]:
     """An order of n plots in which none comes after more than ``reach`` younger ones."""
-    waiting, out = list(range(n)), []
+    waiting, out = list(range(n)), list[int]()
     while waiting:
         oldest = waiting[0]
-        younger = sum(1 for k in out if k > oldest)
+        younger = len([k for k in out if k > oldest])
         pick = 0 if younger >= reach else int(rng.integers(0, min(len(waiting), reach + 1)))
         out.append(waiting.pop(pick))
     return out
@@ -100,7 +100,7 @@ def test_the_lagged_state_is_the_head_without_the_ring() -> None:
 def test_a_plot_older_than_the_lagged_state_is_refused_and_changes_nothing() -> None:
     plots = random_walk(np.random.default_rng(2), 15)
     f = fed(MODELS, plots)
-    before = Filters(*(a.copy() for a in f))
+    before = copied(f)
     assert not feed_row(MODELS, f, 0, plots[3]._replace(t_s=float(f.lag_t_s[0]) - 1e-6))
     assert same(f, before)
     assert feed_row(MODELS, f, 0, plots[3]._replace(t_s=float(f.lag_t_s[0])))
@@ -174,7 +174,7 @@ def test_the_ring_of_one_track_feeds_another() -> None:
 @given(seeds, st.floats(0.0, 60.0))
 def test_prediction_is_one_interaction_and_changes_nothing(seed: int, dt: float) -> None:
     f = fed(DIRICHLET, random_walk(np.random.default_rng(seed), 10))
-    before = Filters(*(a.copy() for a in f))
+    before = copied(f)
     t = f.t_s + dt
     got, known = predicted(DIRICHLET, f, ROW, t)
     want = head(f)
@@ -283,5 +283,3 @@ def test_each_row_gets_the_time_of_the_plot_nearest_to_it() -> None:
     # A row that moves is taken along to the time of each plot.
     f.mean[0, 2] = 2000.0
     assert tracks.nearest_times(f, np.array([0]), z, t).tolist() == [3.0]
-
-

@@ -28,6 +28,7 @@ from trackmesh.services.emi.start import spikes_cut, start_points
 MAX_ITERATIONS = 30
 MAX_PASSES = 4
 MIN_WINDOW = 64
+MAX_WIDENINGS = 32
 STEP_LIMIT = 0.5
 TOLERANCE = 1e-6
 COARSE = 3e-3
@@ -195,7 +196,7 @@ def window(sensor: Sensor, centre: FloatArray, radius: float) -> IntArray:
     """Samples within ``radius`` (horizontally) of ``centre``; the radius grows until there are enough of them."""
     n = sensor.place_m.shape[0]
     chosen = np.empty(n, np.int64)
-    while True:
+    for _ in range(MAX_WIDENINGS):
         count = 0
         for i in range(n):
             dx, dy = sensor.place_m[i, 0] - centre[0], sensor.place_m[i, 1] - centre[1]
@@ -205,6 +206,7 @@ def window(sensor: Sensor, centre: FloatArray, radius: float) -> IntArray:
         if count >= min(n, MIN_WINDOW):
             return chosen[:count]
         radius *= 1.5
+    return np.arange(n)
 
 
 @kernel

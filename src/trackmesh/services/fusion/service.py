@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 
+from trackmesh.protocol.buffer import Buffer
 from trackmesh.protocol.bus import Query, Sample
 from trackmesh.protocol.codec import decode, encode, encoding, open_envelope
 from trackmesh.protocol.errors import QueryFailed, RefusedMessage
@@ -24,7 +25,8 @@ KIND = "fusion"
 _FRAMES_KEPT = 16
 _PLOTS_WAITING = 4096
 _BATCHES_HELD = 64
-_ASK_AGAIN_S = 2.0
+_SENSORS_HELD = 256
+_ASK_EVERY_S = 0.5
 
 
 class FusionService:
@@ -40,14 +42,13 @@ class FusionService:
         self._lock = threading.Lock()
         self._alive: set[str] = set()
         self._held: dict[str, deque[PlotBatch]] = {}
-        self._asked_s: dict[str, float] = {}
+        self._answered: Buffer[SensorInfo] = Buffer(_SENSORS_HELD)
         self._tick_due_s = 0.0
         self._black_box: BlackBox | None = None
 
     def start(self) -> None:
         """Compile, subscribe, serve, and be ready."""
         runtime, keys = self.runtime, self.runtime.keys
-        runtime.health = self.health
         if self.settings.black_box is not None:
             self._black_box = BlackBox(self.settings.black_box, self.unit, self.settings.engine, self.settings.origin)
             runtime.on_exit(self._black_box.close)
@@ -55,12 +56,16 @@ class FusionService:
         started = time.monotonic()
         warm_up(self.settings.engine)
         runtime.log.info("kernels ready after %.1f s", time.monotonic() - started)
-        self._frames = runtime.closing(runtime.bus.publisher(keys.tracks(self.unit.unit_id), history=_FRAMES_KEPT))
+        self._frames = runtime.bus.publisher(keys.tracks(self.unit.unit_id), history=_FRAMES_KEPT)
+        # The engine's thread may publish until it has ended.
+        runtime.on_exit(self._frames.close)
         self._tokens = runtime.closing(runtime.bus.watch_alive(keys.live("*", "*")))
         self._infos = runtime.closing(runtime.bus.subscribe(keys.sensor("*"), history=True))
         self._plots = runtime.closing(runtime.bus.subscribe(keys.plots("*"), history=True, capacity=_PLOTS_WAITING))
+        runtime.health = self.health
         runtime.closing(runtime.bus.serve(keys.service("tracks", self.unit.unit_id), self.answer))
         runtime.spawn("engine", self._run)
+        runtime.spawn("asker", self._ask_unknown)
         runtime.set_state("ready")
 
     def answer(self, query: Query) -> Iterator[tuple[bytes, str]]:
@@ -81,7 +86,7 @@ class FusionService:
             counters = dict(self.engine.counters)
             sensors = [self._sensor_health(sensor_id) for sensor_id in sorted(self.intake.streams)]
         figures |= {f"engine.{name}": float(value) for name, value in counters.items()}
-        figures["plots_dropped_here"] = float(self._dropped())
+        figures["batches_dropped_here"] = float(self._plots.dropped)
         return Health(figures, sensors)
 
     # --- the engine's thread ---
@@ -102,12 +107,16 @@ class FusionService:
                 self.runtime.log.info("sensor %s %s", ident, "is there" if event.alive else "is gone")
         while (sample := self._infos.receive(timeout_s=0)) is not None:
             self._on_info(sample)
+        while (info := self._answered.receive(timeout_s=0)) is not None:
+            self._take_info(info)
 
     def _on_info(self, sample: Sample) -> None:
         try:
             info = decode(sample.payload, SensorInfo, sample.encoding)
             if info.sensor_id != last_chunk(sample.key):
                 raise RefusedMessage("wrong_sensor", f"{sample.key} brought the sensor {info.sensor_id}.")
+            if info.sensor_id not in self.engine.sensors and len(self.engine.sensors) >= self.settings.max_sensors:
+                raise RefusedMessage("too_many_sensors", f"There are {self.settings.max_sensors} sensors already.")
         except RefusedMessage as error:
             self._refuse(last_chunk(sample.key), error)
             return
@@ -130,6 +139,7 @@ class FusionService:
             batch = decode(sample.payload, PlotBatch, sample.encoding, self.settings.max_batch_bytes)
             if batch.sensor_id != sensor_id:
                 raise RefusedMessage("wrong_sensor", f"{sample.key} brought plots of {batch.sensor_id}.")
+            self._check_room(sensor_id)
             now_ns = time.time_ns() if self.settings.clock == "wall" else None
             self.intake.check(batch, now_ns)
         except RefusedMessage as error:
@@ -139,6 +149,11 @@ class FusionService:
             self._take_batch(batch)
         else:
             self._hold(batch)
+
+    def _check_room(self, sensor_id: str) -> None:
+        unknown = sensor_id not in self.engine.sensors and sensor_id not in self._held
+        if unknown and len(self._held) >= _SENSORS_HELD:
+            raise RefusedMessage("too_many_sensors", f"Too many sensors are unknown already, {sensor_id} is left out.")
 
     def _take_batch(self, batch: PlotBatch) -> None:
         if self._black_box:
@@ -175,25 +190,31 @@ class FusionService:
     # --- sensors not yet known ---
 
     def _hold(self, batch: PlotBatch) -> None:
-        """Keep the plots of a sensor of which nothing is known yet, and ask it who it is."""
+        """Keep the plots of a sensor of which nothing is known yet, and have it asked who it is."""
         held = self._held.setdefault(batch.sensor_id, deque())
         held.append(batch)
         if len(held) > _BATCHES_HELD:
             held.popleft()
             detail = f"Nothing is known of sensor {batch.sensor_id}: it must publish its SensorInfo."
             self._refuse(batch.sensor_id, RefusedMessage("unknown_sensor", detail))
-        now_s = time.monotonic()
-        if now_s - self._asked_s.get(batch.sensor_id, -_ASK_AGAIN_S) < _ASK_AGAIN_S:
+
+    def _ask_unknown(self) -> None:
+        """Ask sensors whose plots are held who they are; in a thread of its own, since they may not answer."""
+        while not self.runtime.stopping.wait(_ASK_EVERY_S):
+            for sensor_id in list(self._held):
+                if self.runtime.stopping.is_set():
+                    return
+                for reply in self.runtime.bus.query(self.runtime.keys.sensor(sensor_id), timeout_s=_ASK_EVERY_S):
+                    self._take_answer(sensor_id, reply)
+
+    def _take_answer(self, sensor_id: str, reply: Sample) -> None:
+        try:
+            info = open_envelope(reply.payload, reply.encoding, SensorInfo)
+        except (RefusedMessage, QueryFailed) as error:
+            self.runtime.log.warning("sensor %s gave no information: %s", sensor_id, error)
             return
-        self._asked_s[batch.sensor_id] = now_s
-        for reply in self.runtime.bus.query(self.runtime.keys.sensor(batch.sensor_id), timeout_s=0.5):
-            try:
-                info = open_envelope(reply.payload, reply.encoding, SensorInfo)
-            except (RefusedMessage, QueryFailed) as error:
-                self.runtime.log.warning("sensor %s gave no information: %s", batch.sensor_id, error)
-                continue
-            if isinstance(info, SensorInfo) and info.sensor_id == batch.sensor_id:
-                self._take_info(info)
+        if isinstance(info, SensorInfo) and info.sensor_id == sensor_id:
+            self._answered.offer(info)
 
     # --- counting ---
 
@@ -217,9 +238,6 @@ class FusionService:
             last_t_ns=stream.last_t_ns,
             clutter_density=sensor.system_clutter.value(0, 1.0) if sensor else None,
         )
-
-    def _dropped(self) -> int:
-        return int(getattr(self._plots, "dropped", 0))
 
 
 def run(settings: FusionSettings) -> int:

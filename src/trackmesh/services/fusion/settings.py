@@ -80,5 +80,6 @@ class FusionSettings(ServiceSettings):
     max_age_s: Positive = Field(60.0, description="wall clock: plots older than this are refused")
     max_ahead_s: Positive = Field(2.0, description="wall clock: plots further in the future are refused")
     max_batch_bytes: Annotated[int, Field(ge=1024)] = Field(4 * 2**20, description="larger plot batches are refused")
+    max_sensors: Annotated[int, Field(ge=1, le=4096)] = Field(128, description="more sensors are refused")
     tick_s: Positive = Field(0.25, description="how often time advances without data")
     black_box: Path | None = Field(None, description="file that records the engine's inputs")

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from tests.services.estimation.makers import DIRICHLET, fed_walk, plain_python
+
+from trackmesh.services.estimation import imm, jit
+
+
+def test_kernels_are_compiled_here_and_plain_python_on_request() -> None:
+    assert hasattr(imm.filter_plot, "py_func") or os.environ.get("NUMBA_DISABLE_JIT") == "1"
+    assert plain_python("hasattr(tracks.feed, 'py_func')", "tests.services.estimation.makers") is False
+
+
+def test_compiled_and_plain_give_the_same_numbers() -> None:
+    """To 1e-10 relative: compiled code may contract and reorder sums."""
+    want = plain_python("fed_walk(DIRICHLET).tolist()", "tests.services.estimation.makers")
+    np.testing.assert_allclose(fed_walk(DIRICHLET), want, rtol=1e-10, atol=1e-10)
+
+
+def copied(target: Path) -> ModuleType:
+    """The module ``jit`` from a copy of the services."""
+    services = Path(jit.__file__).resolve().parent.parent
+    for room in ("estimation", "fusion"):
+        shutil.copytree(services / room, target / room, ignore=shutil.ignore_patterns("__pycache__"))
+    spec = importlib.util.spec_from_file_location("copied_jit", target / "estimation" / "jit.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_cache_is_another_after_any_change_of_the_sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "mine"))  # or the copy would point numba elsewhere
+    module = copied(tmp_path)
+    first = module.cache_folder()
+    assert first == module.cache_folder() == jit.cache_folder()
+    with (tmp_path / "fusion" / "life.py").open("a") as source:
+        source.write("# changed\n")
+    second = module.cache_folder()
+    assert second.parent == first.parent
+    assert second != first
+
+
+def test_the_cache_is_where_the_user_keeps_caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert jit.cache_folder().parent == tmp_path / "trackmesh" / "numba"
