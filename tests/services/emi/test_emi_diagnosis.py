@@ -24,7 +24,9 @@ from trackmesh.sim.emi import grid_positions
 GRID = grid_positions((4.0, 4.0), 0.5)
 
 
-def noisy_tensors(principal: list[float], sd: float, n: int, seed: int = 1) -> tuple[FloatArray, FloatArray, FloatArray]:
+def noisy_tensors(
+    principal: list[float], sd: float, n: int, seed: int = 1
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Tensors (n, 6), their covariances and the axis of the truth."""
     u = rotation(0.0, 0.4, 0.7)
     rng = np.random.default_rng(seed)

@@ -112,9 +112,9 @@ def test_a_sector_is_judged_after_a_period_and_its_margin() -> None:
 
 def test_after_a_long_silence_one_miss_is_counted_not_many() -> None:
     life = begun(0.0)
-    assert miss(life, 100.0, whole=False)
+    assert miss(life, 100.0, whole=False, east_m=0.0)
     assert life.looked_s[0, 0] == 100.0
-    assert not miss(life, 100.125, whole=False)
+    assert not miss(life, 100.125, whole=False, east_m=0.0)
 
 
 def test_beyond_its_range_a_radar_misses_nothing() -> None:

@@ -73,8 +73,9 @@ class Options(NamedTuple):
 
 def sensor_arrays(coils: Coils, background: Background) -> Sensor:
     """The geometry as the kernels take it: one row a sample, unit vectors, background columns of order one."""
-    positions = np.array(coils.positions_m, np.float64)
-    axes = np.array(np.broadcast_to(coils.tx_axis, positions.shape), np.float64)
+    # C order throughout: each other memory layout would have the kernels compiled again.
+    positions = np.array(coils.positions_m, np.float64, order="C")
+    axes = np.array(np.broadcast_to(coils.tx_axis, positions.shape), np.float64, order="C")
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     tx, rx = positions + coils.tx_offset_m, positions + coils.rx_offset_m
     flat = positions[:, :2] - positions[:, :2].mean(0)
@@ -84,7 +85,7 @@ def sensor_arrays(coils: Coils, background: Background) -> Sensor:
         rx,
         axes,
         0.5 * (tx + rx),
-        np.array(coils.components, np.float64),
+        np.array(coils.components, np.float64, order="C"),
         np.ascontiguousarray(basis[:, : N_BACKGROUND[background]]),
         float(coils.radius_m) if coils.is_loop else 0.0,
         float(coils.moment_am2),
@@ -161,7 +162,7 @@ def _prepare(index: int, field_t: FloatArray, sigma_t: FloatArray | float | None
         # Any scale will do; one near to the data keeps the numbers in range.
         sigma_t = float(np.abs(y).max(initial=0.0)) or 1.0
     w = np.where(there, 1.0 / np.broadcast_to(sigma_t, field_t.shape), 0.0)
-    return Scan(index, y, w, int(len(sample_there) - sample_there.sum()))
+    return Scan(index, np.ascontiguousarray(y), np.ascontiguousarray(w), int(len(sample_there) - sample_there.sum()))
 
 
 def _without_fit(scan: Scan, sensor: Sensor, setting: Setting, defect: str | None) -> ScanResult | None:

@@ -197,7 +197,7 @@ def primary_field(
         H (n, 3) in A/m, and its gradient (n, 3, 3) by ``offset_m`` in A/m^2.
     """
     offset_m = np.ascontiguousarray(offset_m, np.float64)
-    axes = np.array(np.broadcast_to(axis, offset_m.shape), np.float64)
+    axes = np.array(np.broadcast_to(axis, offset_m.shape), np.float64, order="C")
     axes /= np.sqrt((axes * axes).sum(-1, keepdims=True))
     h, gradient = _primary_many(offset_m, axes, radius_m)
     return moment_am2 * h, moment_am2 * from_elements(gradient)

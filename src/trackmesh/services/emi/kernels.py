@@ -1,24 +1,18 @@
-"""How the hot loops of this room are compiled: one decorator, typed for the type checker."""
+"""What the numerics of this room share: the compiling decorator, and the array types.
+
+Kernels are compiled without fast mathematics, so that a scan's result is the same bits whatever else is computed, and
+release the interpreter lock, so that requests are answered side by side.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeVar, cast
-
-import numba
 import numpy as np
 import numpy.typing as npt
 
-F = TypeVar("F", bound=Callable[..., object])
+from trackmesh.services.estimation.jit import exact_kernel as kernel
+
+__all__ = ["BoolArray", "FloatArray", "IntArray", "kernel"]
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
-
-
-def kernel(function: F) -> F:
-    """Compile on first use, keep the machine code on disk, release the GIL; division by zero gives inf or nan.
-
-    No fast mathematics: results are the same bits on every run, whatever else is computed beside them.
-    """
-    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))

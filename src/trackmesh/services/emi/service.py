@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from trackmesh.protocol.bus import Query
-from trackmesh.protocol.codec import Format, answer, decode, encoding, end, failure
 from trackmesh.protocol.errors import RefusedMessage
-from trackmesh.protocol.messages import EmiScanBatch, Envelope
+from trackmesh.protocol.messages import EmiResult, EmiScanBatch
+from trackmesh.protocol.serving import answers
 from trackmesh.services.emi.convert import to_message, to_request
 from trackmesh.services.emi.engine import Coils, Options, invert
 from trackmesh.services.emi.settings import EmiSettings
@@ -28,7 +28,9 @@ def main(settings: EmiSettings) -> int:
 def start(runtime: ServiceRuntime, settings: EmiSettings) -> None:
     """Compile the kernels, then answer queries."""
     runtime.set_state("compiling")
+    started_s = time.monotonic()
     warm_up()
+    runtime.log.info("kernels ready after %.1f s", time.monotonic() - started_s)
     service = EmiService(runtime, settings)
     key = runtime.keys.service(KIND, settings.unit_id)
     runtime.closing(runtime.bus.serve(key, service.handle, workers=settings.workers))
@@ -56,39 +58,33 @@ class EmiService:
 
     def handle(self, query: Query) -> Iterator[Reply]:
         """One envelope a scan, and the end; an error envelope in place of what is refused or given up."""
-        fmt: Format = "json" if query.parameters.get("fmt") == "json" else "msgpack"
-        kind, done = encoding(Envelope, fmt), 0
         started_s = time.monotonic()
-        try:
-            batch = self._accept(query)
-            for result in invert(*to_request(batch, self._settings.lr_threshold)):
-                self._go_on(started_s)
-                yield answer(to_message(batch, result), fmt), kind
-                done += 1
-                self._runtime.counters.count("scans")
-                self._runtime.counters.count(f"scans_{result.status}")
-        except RefusedMessage as refusal:
-            self._runtime.counters.refuse(refusal.reason)
-            yield failure(refusal.reason, refusal.detail, fmt), kind
-        yield end(done, fmt), kind
+        counters, largest = self._runtime.counters, self._settings.max_request_bytes
+        counters.count("requests")
+        yield from answers(query, EmiScanBatch, self._results, counters.refuse, max_bytes=largest)
         self._runtime.latencies.record(time.monotonic() - started_s)
 
-    def _accept(self, query: Query) -> EmiScanBatch:
-        self._runtime.counters.count("requests")
-        batch = decode(query.payload, EmiScanBatch, query.encoding, self._settings.max_request_bytes)
-        n_samples, limit = batch.field.shape[2], self._settings.max_samples
-        if n_samples > limit:
-            raise RefusedMessage("too_large", f"A scan has {n_samples} samples, at most {limit} are accepted.")
-        if batch.field.size > self._settings.max_numbers:
-            raise RefusedMessage(
-                "too_large",
-                f"The request holds {batch.field.size} numbers, at most {self._settings.max_numbers} are accepted.",
-            )
-        return batch
+    def _results(self, batch: EmiScanBatch) -> Iterator[EmiResult]:
+        started_s = time.monotonic()
+        self._check_size(batch)
+        for result in invert(*to_request(batch, self._settings.lr_threshold)):
+            self._check_time(started_s)
+            self._runtime.counters.count("scans")
+            self._runtime.counters.count(f"scans_{result.status}")
+            yield to_message(batch, result)
 
-    def _go_on(self, started_s: float) -> None:
+    def _check_size(self, batch: EmiScanBatch) -> None:
+        limits = self._settings
+        for what, size, limit in (
+            ("A scan has {} samples", batch.field.shape[2], limits.max_samples),
+            ("The request holds {} numbers", batch.field.size, limits.max_numbers),
+        ):
+            if size > limit:
+                raise RefusedMessage("too_large", f"{what.format(size)}, at most {limit} are accepted.")
+
+    def _check_time(self, started_s: float) -> None:
+        limit_s = self._settings.request_deadline_s
         if self._runtime.stopping.is_set():
             raise RefusedMessage("stopping", "The service is stopping.")
-        if time.monotonic() - started_s > self._settings.request_deadline_s:
-            limit = self._settings.request_deadline_s
-            raise RefusedMessage("deadline", f"The request was given up after {limit:g} s; ask for fewer scans.")
+        if time.monotonic() - started_s > limit_s:
+            raise RefusedMessage("deadline", f"The request was given up after {limit_s:g} s; ask for fewer scans.")

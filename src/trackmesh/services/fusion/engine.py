@@ -92,6 +92,8 @@ class FusionEngine:
             return
         if self.origin is None and info.site is not None:
             self.origin = info.site
+            for known in self.sensors.values():
+                known.settle(self.origin)
         sensor = Sensor(old.index if old else len(self.sensors), info, self.origin)
         self.sensors[info.sensor_id] = sensor
         longest = max(s.info.period_s for s in self.sensors.values())

@@ -53,11 +53,15 @@ class Sensor:
     def __init__(self, index: int, info: SensorInfo, origin: Geodetic | None) -> None:
         self.index = index
         self.info = info
-        self.site, self._turn = _place(info, origin)
-        self._origin = origin
+        self.settle(origin)
         area = np.pi * info.max_range_m**2
         self.local_clutter = ClutterDensity(area, info.clutter_density)
         self.system_clutter = ClutterDensity(area, info.clutter_density)
+
+    def settle(self, origin: Geodetic | None) -> None:
+        """Place the sensor in the plane of this origin, which may be known only after the sensor."""
+        self.site, self._turn = _place(self.info, origin)
+        self._origin = origin
 
     def plane(self, batch: PlotBatch) -> tuple[FloatArray, FloatArray]:
         """Positions (n, 2) and covariances (n, 3) of a batch in the system plane.
@@ -90,10 +94,13 @@ class Sensor:
         z, R = polar_to_plane(batch.values[:, 0], batch.values[:, 1], elevation, variances[:, 0], variances[:, 1])
         if self._turn is None:
             return z + self.site, R
-        T = self._turn
+        level, tilt = self._turn[:, :2], self._turn[:, 2]
+        z = z @ level.T + self.site
+        if elevation is not None:
+            z += np.outer(batch.values[:, 0] * np.sin(elevation), tilt)
         full = np.stack([R[:, 0], R[:, 1], R[:, 1], R[:, 2]], axis=1).reshape(-1, 2, 2)
-        full = T @ full @ T.T
-        return z @ T.T + self.site, np.stack([full[:, 0, 0], full[:, 0, 1], full[:, 1, 1]], axis=1)
+        full = level @ full @ level.T
+        return z, np.stack([full[:, 0, 0], full[:, 0, 1], full[:, 1, 1]], axis=1)
 
     def _geodetic(self, batch: PlotBatch) -> FloatArray:
         if self._origin is None:
@@ -107,7 +114,7 @@ class Sensor:
 
 
 def _place(info: SensorInfo, origin: Geodetic | None) -> tuple[FloatArray, FloatArray | None]:
-    """The site in the system plane, and the 2x2 turn from the site's own east and north to those of the plane."""
+    """The site in the system plane, and the (2, 3) turn from the site's own east, north and up to its."""
     if info.site_enu_m is not None:
         return np.array(info.site_enu_m[:2], float), None
     if info.site is None or origin is None:
@@ -116,8 +123,8 @@ def _place(info: SensorInfo, origin: Geodetic | None) -> tuple[FloatArray, Float
     east, north, _ = pymap3d.geodetic2enu(
         s.latitude_deg, s.longitude_deg, s.height_m, o.latitude_deg, o.longitude_deg, o.height_m
     )
-    turn = np.empty((2, 2))
-    for k, step in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))):
+    turn = np.empty((2, 3))
+    for k, step in enumerate(np.eye(3).tolist()):
         u, v, w = pymap3d.enu2uvw(*step, s.latitude_deg, s.longitude_deg)
         east_k, north_k, _ = _uvw2enu(float(u), float(v), float(w), o)
         turn[:, k] = east_k, north_k
