@@ -12,8 +12,10 @@ name is bound by the whole message (``"n"`` has one length in all its fields, se
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import chain
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +46,9 @@ class ArrayField:
     shape: tuple[int | str | None, ...]
     ge: float | None = None
     le: float | None = None
+
+    also: ClassVar[tuple[type, ...]] = ()
+    """Other types than numbers that a list may hold."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_plain_validator_function(
@@ -83,38 +88,62 @@ class ArrayField:
     def _parse(self, value: Any) -> AnyArray:
         if isinstance(value, dict):
             return self._from_wire(value)
-        if not isinstance(value, list | np.ndarray):
-            raise PydanticCustomError("wrong_type", "an array must be a map with dtype, shape and data, or a list")
-        try:
-            array = np.asarray(value)
-        except ValueError:
-            raise PydanticCustomError("wrong_length", "the rows of an array have unequal lengths") from None
-        if array.size == 0:
-            return np.zeros(self._empty_shape(array), self.dtype)
-        return self._cast(array)
-
-    def _empty_shape(self, array: AnyArray) -> tuple[int, ...]:
-        # JSON cannot tell (0, c) from (0,): [] stands for any empty array of the right number of axes.
-        if array.ndim == len(self.shape):
-            return array.shape
-        return tuple(a if isinstance(a, int) else 0 for a in self.shape)
+        if isinstance(value, np.ndarray):
+            return self._cast(value) if value.size else np.zeros(value.shape, self.dtype)
+        if isinstance(value, list):
+            return self._from_list(value)
+        raise PydanticCustomError("wrong_type", "an array must be a map with dtype, shape and data, or a list")
 
     def _cast(self, array: AnyArray) -> AnyArray:
         want = np.dtype(self.dtype)
         if array.dtype == want and array.flags.c_contiguous:
             return array
         if array.dtype.kind not in "iuf" or (want.kind in "iu" and array.dtype.kind == "f"):
-            raise PydanticCustomError(
-                "wrong_dtype",
-                "elements must be {want} numbers",
-                {"want": "integer" if want.kind in "iu" else "real"},
-            )
-        if want.kind in "iu" and array.size:
+            raise self._wrong_dtype()
+        if want.kind in "iu":
             info = np.iinfo(want)
             if int(array.min()) < info.min or int(array.max()) > info.max:
-                raise PydanticCustomError("out_of_bounds", "elements do not fit {dtype}", {"dtype": self.dtype})
+                raise self._no_fit()
         with np.errstate(over="ignore"):
             return np.ascontiguousarray(array, dtype=want)
+
+    def _from_list(self, value: list[Any]) -> AnyArray:
+        # Judged before numpy sees it: numpy takes texts and booleans for numbers, and room for the longest text times
+        # the number of elements.
+        flat, shape = self._flatten(value)
+        want = np.dtype(self.dtype)
+        numbers = (int, np.integer) if want.kind in "iu" else (int, float, np.integer, np.floating)
+        kinds = set(map(type, flat))
+        if list in kinds:
+            raise PydanticCustomError("wrong_length", "expected {want} axes, got more", {"want": len(self.shape)})
+        if bool in kinds or not all(issubclass(kind, (*numbers, *self.also)) for kind in kinds):
+            raise self._wrong_dtype()
+        try:
+            with np.errstate(over="ignore"):
+                return np.array(flat, want).reshape(shape)
+        except OverflowError:
+            raise self._no_fit() from None
+
+    def _flatten(self, value: list[Any]) -> tuple[Sequence[Any], list[int]]:
+        """The elements in order, and the shape; [] stands for no rows, however long they would be."""
+        rows: list[Any] = value
+        shape = [len(value)]
+        for axis in self.shape[1:]:
+            if not all(isinstance(row, list | tuple | np.ndarray) for row in rows):
+                raise PydanticCustomError("wrong_length", "expected {want} axes, got fewer", {"want": len(self.shape)})
+            lengths = set(map(len, rows))
+            if len(lengths) > 1:
+                raise PydanticCustomError("wrong_length", "the rows of an array have unequal lengths")
+            shape.append(lengths.pop() if lengths else axis if isinstance(axis, int) else 0)
+            rows = list(chain.from_iterable(rows))
+        return rows, shape
+
+    def _wrong_dtype(self) -> PydanticCustomError:
+        kind = "integer" if np.dtype(self.dtype).kind in "iu" else "real"
+        return PydanticCustomError("wrong_dtype", "elements must be {want} numbers", {"want": kind})
+
+    def _no_fit(self) -> PydanticCustomError:
+        return PydanticCustomError("out_of_bounds", "elements do not fit {dtype}", {"dtype": self.dtype})
 
     def _from_wire(self, value: dict[Any, Any]) -> AnyArray:
         if value.keys() != _KEYS:

@@ -21,7 +21,10 @@ M = TypeVar("M", bound=TopMessage)
 R = TypeVar("R", bound=Message)
 
 MAX_BYTES = 64 * 2**20
-"""No message is larger; services may set lower limits."""
+"""No message is larger; many kinds (``TopMessage.most_bytes``) and services set lower limits."""
+
+_ERRORS_READ = 1000
+_SILENT: dict[type, str] = {msgpack.StackError: "nested too deeply"}
 
 _OURS = {
     "wrong_type",
@@ -44,6 +47,9 @@ _PYDANTIC = {
     "less_than_equal": "out_of_bounds",
     "too_long": "wrong_length",
     "too_short": "wrong_length",
+    "string_too_long": "wrong_length",
+    "string_unicode": "malformed",
+    "invalid_key": "unknown_field",
     "json_invalid": "malformed",
 }
 
@@ -68,13 +74,14 @@ def decode(data: bytes, kind: type[M], encoding_str: str = "", max_bytes: int = 
         kind: the message class that the key calls for.
         encoding_str: the encoding it came with. A plain or empty one is taken as msgpack of ``kind``; one that names
             another schema is refused.
-        max_bytes: the largest payload accepted.
+        max_bytes: the largest payload accepted, if that is less than the kind's own limit.
 
     Raises:
         RefusedMessage: whatever is wrong with it.
     """
-    if len(data) > max_bytes:
-        raise RefusedMessage("too_large", f"The message has {len(data)} bytes, at most {max_bytes} are accepted.")
+    most = min(max_bytes, kind.most_bytes)
+    if len(data) > most:
+        raise RefusedMessage("too_large", f"The message has {len(data)} bytes, at most {most} are accepted.")
     fmt = _format_for(kind, encoding_str)
     try:
         if fmt == "json":
@@ -98,6 +105,9 @@ def from_object(payload: object, kind: type[R]) -> R:
 
 def refusal(name: str, error: ValidationError) -> RefusedMessage:
     """One reason and one sentence for the first thing that is wrong."""
+    if (count := error.error_count()) > _ERRORS_READ:
+        # To look at each of a million errors takes seconds.
+        return RefusedMessage("invalid", f"{name}: {count} things are wrong with it.")
     first = error.errors(include_url=False, include_input=False, include_context=False)[0]
     where = ".".join(str(part) for part in first["loc"])
     return RefusedMessage(_reason(first), f"{name}{'.' + where if where else ''}: {first['msg']}")
@@ -132,7 +142,7 @@ def open_envelope(data: bytes, encoding_str: str, kind: type[M]) -> M | int:
     if envelope.kind == "end":
         return envelope.count or 0
     if envelope.schema_name != kind.schema_id():
-        raise RefusedMessage("wrong_schema", f"Expected {kind.schema_id()}, got {envelope.schema_name}.")
+        raise RefusedMessage("wrong_schema", f"Expected {kind.schema_id()}, got {envelope.schema_name!r:.80}.")
     return from_object(envelope.payload, kind)
 
 
@@ -148,12 +158,13 @@ def _unpack(data: bytes) -> Any:
     try:
         return msgpack.unpackb(data)
     except (ValueError, msgpack.UnpackException) as error:
-        raise RefusedMessage("malformed", f"The bytes are no msgpack: {str(error)[:120] or 'truncated'}.") from None
+        why = str(error)[:120] or _SILENT.get(type(error), "against its format")
+        raise RefusedMessage("malformed", f"The bytes are no msgpack: {why}.") from None
 
 
 def _reason(error: ErrorDetails) -> str:
     kind = error["type"]
-    if "schema_version" in error["loc"]:
+    if error["loc"] == ("schema_version",):
         return "wrong_version"
     if kind in _OURS:
         return kind

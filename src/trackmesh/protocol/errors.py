@@ -9,6 +9,8 @@ TrackmeshError
 
 from __future__ import annotations
 
+_LONGEST = 299
+
 
 class TrackmeshError(Exception):
     """Every error of trackmesh that a user may meet; ``str()`` is one clear sentence."""
@@ -19,13 +21,19 @@ class RefusedMessage(TrackmeshError, ValueError):
 
     Attributes:
         reason: short machine-readable reason, used as the name of a counter (``"not_finite"``).
-        detail: one sentence for people.
+        detail: one sentence for people, in one printable line of at most 300 characters.
     """
 
     def __init__(self, reason: str, detail: str) -> None:
-        super().__init__(f"{detail} [{reason}]")
+        # The sentence may quote what came from outside, at any length.
+        self.detail = _one_line(detail)
         self.reason = reason
-        self.detail = detail
+        super().__init__(f"{self.detail} [{reason}]")
+
+
+def _one_line(text: str) -> str:
+    line = " ".join(text[:_LONGEST].split()).rstrip(".")
+    return "".join(c if c.isprintable() else "?" for c in line) + "."
 
 
 class BusError(TrackmeshError):

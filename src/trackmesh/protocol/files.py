@@ -11,7 +11,9 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TextIO
+from typing import Annotated, Any, Self, TextIO
+
+from pydantic import Field
 
 from trackmesh.protocol.codec import from_object
 from trackmesh.protocol.errors import RefusedMessage, TrackmeshError
@@ -38,9 +40,9 @@ class UnitRecord(Message):
     """Who recorded a black box, and with which settings: what is needed to give the same frames again."""
 
     unit_id: Id
-    unit_number: int
+    unit_number: Annotated[int, Field(ge=0, le=4095)]
     boot_id: BootId
-    first_track_number: int
+    first_track_number: Annotated[int, Field(ge=0, lt=2**41)]
     settings: dict[str, Any]
 
 
@@ -75,6 +77,8 @@ def from_line(line: str) -> Message:
         fields = json.loads(line)
     except ValueError as error:
         raise RefusedMessage("malformed", f"No JSON: {error}.") from None
+    except RecursionError:
+        raise RefusedMessage("malformed", "No JSON of ours: it is nested too deeply.") from None
     if not isinstance(fields, dict):
         raise RefusedMessage("malformed", "A line must be a JSON object.")
     name = fields.pop("type", None)

@@ -110,6 +110,6 @@ def _match(pattern: list[str], chunks: list[str]) -> bool:
 
 
 def _chunk(text: str, what: str) -> str:
-    if text != "*" and not ID_RE.match(text):
+    if text != "*" and not ID_RE.fullmatch(text):
         raise TrackmeshError(f"The {what} {text!r} must match {ID_PATTERN}.")
     return text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import uuid
 from collections.abc import Iterator, Sequence
@@ -14,11 +15,21 @@ from pydantic import ValidationError
 from trackmesh.protocol.arrays import IntArray
 from trackmesh.protocol.bus import Bus, Query
 from trackmesh.protocol.codec import answer, encode, encoding, end, refusal
+from trackmesh.protocol.errors import RefusedMessage
 from trackmesh.protocol.keys import Keys
 from trackmesh.protocol.messages import Envelope, PlotBatch, ScanPart, SensorInfo
 from trackmesh.protocol.serving import asked_format
 
-PLOT_HISTORY = 64
+PLOT_HISTORY_S = 10.0
+"""What an outage of this length withheld is sent afterwards; older plots are of no use to a tracker."""
+
+_LEAST_HISTORY = 16
+_MOST_HISTORY = 4096
+
+
+def plot_history(batches_per_s: float) -> int:
+    """How many batches a sensor must keep to lose none in an outage of ``PLOT_HISTORY_S``."""
+    return min(max(math.ceil(PLOT_HISTORY_S * batches_per_s), _LEAST_HISTORY), _MOST_HISTORY)
 
 
 class SensorPublisher:
@@ -28,23 +39,26 @@ class SensorPublisher:
         bus: a way into the network; it is not closed.
         realm: the deployment's key space.
         info: who the sensor is.
-        history: how many batches are kept to fill the gaps of an outage; 0 for none.
-
-    Attributes:
-        boot_id: drawn anew for each publisher.
+        history: how many batches are kept to fill the gaps of an outage, 0 for none; None counts one batch a period of
+            the sensor (a sensor that sends sectors says ``plot_history(sectors / period_s)``).
+        boot_id: tells this start of the sensor from others; drawn anew if not given.
     """
 
-    def __init__(self, bus: Bus, realm: str, info: SensorInfo, *, history: int = PLOT_HISTORY) -> None:
+    def __init__(
+        self, bus: Bus, realm: str, info: SensorInfo, *, history: int | None = None, boot_id: str | None = None
+    ) -> None:
         keys = Keys(realm)
         self.info = info
-        self.boot_id = uuid.uuid4().hex[:16]
+        self.boot_id = boot_id or uuid.uuid4().hex[:16]
         self._seq = 0
         self._lock = threading.Lock()
         self._info_publisher = bus.publisher(keys.sensor(info.sensor_id), history=1)
-        self._plots = bus.publisher(keys.plots(info.sensor_id), history=history)
+        kept = plot_history(1.0 / info.period_s) if history is None else history
+        self._plots = bus.publisher(keys.plots(info.sensor_id), history=kept)
         self._server = bus.serve(keys.sensor(info.sensor_id), self._who, workers=1)
-        self._token = bus.declare_alive(keys.live("sensor", info.sensor_id))
+        # First who it is, then that it is there: who hears of it can already know it.
         self.announce(info)
+        self._token = bus.declare_alive(keys.live("sensor", info.sensor_id))
 
     def announce(self, info: SensorInfo) -> None:
         """Publish who the sensor is, when it has changed."""
@@ -82,9 +96,24 @@ class SensorPublisher:
                 )
             except ValidationError as error:
                 raise refusal("PlotBatch", error) from None
-            self._seq += 1
-            self._plots.put(encode(batch), encoding(batch))
+            self._put(batch)
         return batch
+
+    def publish_batch(self, batch: PlotBatch) -> None:
+        """Publish a batch that was made elsewhere, with the numbering of its maker.
+
+        Raises:
+            RefusedMessage: ``wrong_sensor``, the batch is of another sensor.
+        """
+        if batch.sensor_id != self.info.sensor_id:
+            detail = f"Sensor {self.info.sensor_id} cannot publish plots of {batch.sensor_id}."
+            raise RefusedMessage("wrong_sensor", detail)
+        with self._lock:
+            self._put(batch)
+
+    def _put(self, batch: PlotBatch) -> None:
+        self._seq = batch.seq + 1
+        self._plots.put(encode(batch), encoding(batch))
 
     def close(self) -> None:
         """Be alive no longer."""

@@ -215,7 +215,7 @@ class ZenohBus:
                     break
             if attempt == 0:
                 where = " or ".join(endpoints_of(config, "connect"))
-                _log.warning("no router answers at %s yet, trying for %g s", where, timeout_s)
+                _log.info("no router answers at %s yet, trying for %g s", where, timeout_s)
         raise BusError(_nobody(config, config_path))
 
     def publisher(self, key: str, *, history: int = 0) -> _ZenohPublisher:

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import threading
 import time
-import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
-from trackmesh.protocol.bus import Bus, Query
-from trackmesh.protocol.codec import Format, answer, encode, encoding, end
+from trackmesh.protocol.bus import Bus
+from trackmesh.protocol.codec import encode, encoding
 from trackmesh.protocol.keys import Keys
-from trackmesh.protocol.messages import Envelope, SensorInfo
+from trackmesh.protocol.sensor import SensorPublisher, plot_history
 from trackmesh.sim.radar import radar_batches, sensor_info
 from trackmesh.sim.recording import TRUTH_PERIOD_S
 from trackmesh.sim.scenario import Scenario
@@ -22,8 +21,6 @@ from trackmesh.sim.truth import World, truth_frame
 
 LONGEST_WAIT_S = 1.0
 """The wall clock may be set while we wait; it is looked at again after this time."""
-
-PLOT_HISTORY_TURNS = 2
 
 Clock = Callable[[], int]
 
@@ -49,18 +46,19 @@ def run_radar(
         ScenarioError: the scenario has no such radar.
     """
     radar, keys = scenario.radar(radar_id), keys or Keys()
-    world, boot_id, sent = World(scenario, seed), boot_id or uuid.uuid4().hex, 0
-    with _Announced(bus, keys, sensor_info(scenario, radar)):
-        publisher = bus.publisher(keys.plots(radar.id), history=PLOT_HISTORY_TURNS * radar.sectors)
+    world, sent, info = World(scenario, seed), 0, sensor_info(scenario, radar)
+    history = plot_history(radar.sectors / radar.period_s)
+    with SensorPublisher(bus, keys.realm, info, history=history, boot_id=boot_id) as sensor:
         while not stop.is_set():
             after_s = max(0.0, (clock() - start_ns) * 1e-9)
-            batches = radar_batches(world, radar, boot_id=boot_id, start_ns=start_ns, after_s=after_s, first_seq=sent)
+            batches = radar_batches(
+                world, radar, boot_id=sensor.boot_id, start_ns=start_ns, after_s=after_s, first_seq=sent
+            )
             for due_ns, batch in batches:
                 if not wait_until(due_ns, stop, clock) or clock() - due_ns > radar.period_s * 1e9:
                     break
-                publisher.put(encode(batch), encoding(batch))
+                sensor.publish_batch(batch)
                 sent += 1
-        publisher.close()
     return sent
 
 
@@ -97,27 +95,3 @@ def wait_until(due_ns: int, stop: threading.Event, clock: Clock = time.time_ns) 
             return True
         stop.wait(min(left_s, LONGEST_WAIT_S))
     return False
-
-
-class _Announced:
-    """A sensor that is alive, has said who it is, and answers who asks."""
-
-    def __init__(self, bus: Bus, keys: Keys, info: SensorInfo) -> None:
-        self._info = info
-        key = keys.sensor(info.sensor_id)
-        self._publisher = bus.publisher(key, history=1)
-        self._publisher.put(encode(info), encoding(info))
-        self._server = bus.serve(key, self._answer, workers=1)
-        self._token = bus.declare_alive(keys.live("sensor", info.sensor_id))
-
-    def _answer(self, query: Query) -> Iterator[tuple[bytes, str]]:
-        fmt: Format = "json" if query.parameters.get("fmt") == "json" else "msgpack"
-        yield answer(self._info, fmt), encoding(Envelope, fmt)
-        yield end(1, fmt), encoding(Envelope, fmt)
-
-    def __enter__(self) -> _Announced:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        for declared in (self._token, self._server, self._publisher):
-            declared.close()

@@ -116,6 +116,12 @@ def test_a_weak_target_is_seen_well_before_it_is_certain() -> None:
     assert all("depth_uncertain" in r.reasons for r in results if r.status == "low_snr")
 
 
+@pytest.mark.parametrize(("snr_db", "told"), [(0.0, True), (30.0, False)])
+def test_a_covariance_that_is_too_small_is_told(snr_db: float, told: bool) -> None:
+    field, sigma = noisy(clean_field_nt(COARSE, ball()), snr_db, 5)
+    assert all(("covariance_optimistic" in r.reasons) == told for r in solve(COARSE, field, sigma))
+
+
 def test_one_bad_scan_leaves_the_others_bit_for_bit() -> None:
     field, sigma = noisy(clean_field_nt(COARSE, rod()), 20.0, 8)
     good = solve(COARSE, field, sigma)
@@ -242,8 +248,26 @@ def test_position_does_not_depend_on_the_unit_of_the_field() -> None:
     np.testing.assert_allclose(huge.tensor_m3, 1e12 * usual.tensor_m3, rtol=1e-6)
 
 
+@pytest.mark.parametrize("sigma", [None, 1.0])
+@pytest.mark.parametrize("level", [1.0, 1e9, -0.1])
+def test_a_stuck_sensor_sees_no_target(level: float, sigma: float | None) -> None:
+    field = np.full((1, 1, len(COARSE.positions_m), 3), level)
+    field[..., 2] *= 3.0
+    assert solve(COARSE, field, sigma)[0].status == "no_target"
+
+
+def test_a_field_without_noise_has_finite_answers() -> None:
+    (result,) = solve(COARSE, clean_field_nt(COARSE, rod()), None)
+    assert result.status == "ok"
+    assert error_m(result, rod()) < 1e-6
+    assert result.target is not None
+    numbers = [result.chi2, result.likelihood_ratio, result.sigma_t, result.target.axis_sd_rad]
+    assert np.isfinite([x for x in numbers if x is not None]).all()
+    assert np.isfinite(result.target.covariance).all()
+
+
 def test_numbers_beyond_reason_are_invalid_and_not_a_crash() -> None:
-    field = np.full((3, 1, len(COARSE.positions_m), 3), 1e300)
+    field = 1e300 * np.random.default_rng(1).normal(size=(3, 1, len(COARSE.positions_m), 3))
     field[1], sigma = noisy(clean_field_nt(COARSE, rod()), 20.0, 1)
     statuses = [r.status for r in solve(COARSE, field, sigma)]
     assert statuses == ["invalid", "ok", "invalid"]

@@ -14,9 +14,10 @@ from trackmesh.services.emi.design import (
 )
 from trackmesh.services.emi.engine import XYZ, Z_ONLY, Background, Coils, Options, search_bounds, sensor_arrays
 from trackmesh.services.emi.fields import from_elements, primary_field, secondary_field, to_elements
+from trackmesh.services.emi.fit import Data, Enough, Fit, fit_target
 from trackmesh.services.emi.kernels import FloatArray
 from trackmesh.services.emi.polarizability import rotation, world_tensor
-from trackmesh.services.emi.varpro import Fit, evaluate, fit_target, linear_part
+from trackmesh.services.emi.varpro import evaluate, linear_part
 from trackmesh.sim.emi import grid_positions
 
 MOMENT = 20.0 * np.pi * 0.25
@@ -42,7 +43,9 @@ def field(c: Coils, r: FloatArray, tensor: FloatArray) -> FloatArray:
 def fit(c: Coils, y: FloatArray, background: Background = "const", robust: bool = True) -> Fit:
     sensor = sensor_arrays(c, background)
     w = np.full(y.shape, 1.0 / np.abs(y).max())
-    return fit_target(sensor, y, w, search_bounds(sensor.place_m, Options()), robust, 2.0, 0.0, 0.01)
+    return fit_target(
+        Data(sensor, y, w, search_bounds(sensor.place_m, Options()), 2.0), robust, Enough(0.0, 0.01, 0.0, 0.0)
+    )
 
 
 def design(sensor: Sensor, r: FloatArray, tensor: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
@@ -159,7 +162,7 @@ def test_scipy_finds_the_same_minimum(is_loop: bool) -> None:
     sensor, unit = sensor_arrays(c, "const"), float(np.abs(y).max())
     everywhere = search_bounds(sensor.place_m, Options())
     w = np.full(y.shape, 1.0 / unit)
-    ours = fit_target(sensor, y, w, everywhere, False, 1e3, 0.0, 0.1)
+    ours = fit_target(Data(sensor, y, w, everywhere, 1e3), False, Enough(0.0, 0.1, 0.0, 0.0))
 
     def misfit(x: FloatArray) -> FloatArray:
         levels = unit * x[9:].reshape(1, 3, 1)

@@ -27,8 +27,7 @@ def test_compiled_and_plain_give_the_same_numbers() -> None:
 def copied(target: Path) -> ModuleType:
     """The module ``jit`` from a copy of the services."""
     services = Path(jit.__file__).resolve().parent.parent
-    for room in ("estimation", "fusion"):
-        shutil.copytree(services / room, target / room, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(services, target, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)
     spec = importlib.util.spec_from_file_location("copied_jit", target / "estimation" / "jit.py")
     assert spec is not None
     assert spec.loader is not None
@@ -40,15 +39,31 @@ def copied(target: Path) -> ModuleType:
 def test_the_cache_is_another_after_any_change_of_the_sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "mine"))  # or the copy would point numba elsewhere
     module = copied(tmp_path)
-    first = module.cache_folder()
-    assert first == module.cache_folder() == jit.cache_folder()
-    with (tmp_path / "fusion" / "life.py").open("a") as source:
+    first = {room: module.cache_folder(room) for room in ("estimation", "fusion", "emi")}
+    assert first == {room: jit.cache_folder(room) for room in first}
+    with (tmp_path / "estimation" / "imm.py").open("a") as source:
         source.write("# changed\n")
-    second = module.cache_folder()
-    assert second.parent == first.parent
-    assert second != first
+    module.cache_folder.cache_clear()
+    second = {room: module.cache_folder(room) for room in first}
+    assert {folder.parent for folder in second.values()} == {first["fusion"].parent}
+    assert [room for room in first if first[room] != second[room]] == ["estimation", "fusion"]
 
 
 def test_the_cache_is_where_the_user_keeps_caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TRACKMESH_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert jit.cache_folder().parent == tmp_path / "trackmesh" / "numba"
+    assert jit.cache_folder.__wrapped__("emi").parent == tmp_path / "trackmesh" / "numba"
+    monkeypatch.setenv("TRACKMESH_CACHE", str(tmp_path / "ours"))
+    assert jit.cache_folder.__wrapped__("emi").parent == tmp_path / "ours" / "numba"
+
+
+def test_where_nothing_can_be_written_the_cache_is_of_this_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("TRACKMESH_CACHE", str(tmp_path / "file"))
+    folders = jit.cache_folder.__wrapped__("emi"), jit.cache_folder.__wrapped__("emi")
+    assert folders[0] != folders[1]
+    assert all(folder.is_dir() for folder in folders)
+    for folder in folders:
+        folder.rmdir()

@@ -55,6 +55,10 @@ def position_sensor(sensor_id: str = "ais", **change: Any) -> SensorInfo:
     return SensorInfo(sensor_id=sensor_id, kind="position", **known | change)
 
 
+NORTH = radar("north")
+EAST = radar("east", 40e3, 10e3, period_s=5.0)
+
+
 # --- what they send ---
 
 
@@ -99,6 +103,8 @@ def fleet(*targets: tuple[float, float, float, float]) -> Fleet:
 
 FAR_APART = fleet((30e3, 20e3, 100, 40), (-20e3, 45e3, -60, 120), (15e3, -40e3, 10, -150), (-35e3, -30e3, 180, 20))
 
+ONE = fleet((30e3, 20e3, 100.0, 40.0))
+
 
 def scans(
     info: SensorInfo, targets: Fleet, until_s: float, *, offset_s: float = 0.0, seed: int = 1, p_detect: float = 1.0
@@ -112,7 +118,7 @@ def scans(
 
 
 def sector_scans(info: SensorInfo, targets: Fleet, until_s: float, sectors: int, seed: int = 1) -> Iterator[PlotBatch]:
-    """A turning beam: plots at the time at which the beam passes, delivered sector by sector; empty ones are left out."""
+    """A turning beam: plots at the time at which the beam passes, by sectors; empty ones are left out."""
     rng = np.random.default_rng(seed)
     site = np.array((info.site_enu_m or [0.0, 0.0])[:2])
     for turn in range(int(until_s / info.period_s)):
@@ -171,14 +177,14 @@ def nearest(frame: TrackFrame, place: FloatArray) -> tuple[int, float]:
 
 def short_run() -> list[list[float]]:
     """Two radars, four targets, 20 s with one batch late and out of order: the states and more of every frame."""
-    north, east = radar("north"), radar("east", 40e3, 10e3, period_s=5.0)
-    batches = in_time_order(scans(north, FAR_APART, 20.0), scans(east, FAR_APART, 20.0, offset_s=0.7, seed=2))
+    batches = in_time_order(scans(NORTH, FAR_APART, 20.0), scans(EAST, FAR_APART, 20.0, offset_s=0.7, seed=2))
     batches[4], batches[5] = batches[5], batches[4]
-    tracker = engine(north, east, publish_tentative=True)
-    return [
-        np.concatenate([f.track_id - (3 << 41), f.state.ravel(), f.model_probability.ravel(), f.members.ravel()]).tolist()
-        for f in drive(tracker, batches)
-    ]
+    tracker = engine(NORTH, EAST, publish_tentative=True)
+    out = []
+    for f in drive(tracker, batches):
+        parts = f.track_id - (3 << 41), f.state.ravel(), f.model_probability.ravel(), f.members.ravel()
+        out.append([float(v) for part in parts for v in part])
+    return out
 
 
 # --- layers ---

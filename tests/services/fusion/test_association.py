@@ -9,6 +9,7 @@ from trackmesh.services.estimation.pairs import PairRules
 from trackmesh.services.fusion.association import DeclaredPairs, LocalTracks, SequentialTest
 
 SIGMA = np.array([100.0, 100.0, 10.0, 10.0])
+EAST = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def tracks(number: list[int] | IntArray, x: FloatArray) -> LocalTracks:
@@ -22,7 +23,7 @@ def sky(rng: np.random.Generator, n: int, span_m: float = 1e5) -> FloatArray:
 
 def wander(rng: np.random.Generator, error: FloatArray) -> FloatArray:
     """Errors of a local filter: those of two seconds ago count for half."""
-    return 0.5 * error + np.sqrt(0.75) * SIGMA * rng.standard_normal(error.shape)
+    return np.asarray(0.5 * error + np.sqrt(0.75) * SIGMA * rng.standard_normal(error.shape))
 
 
 def declared(pairs: DeclaredPairs, a: LocalTracks, b: LocalTracks) -> set[tuple[int, int]]:
@@ -37,7 +38,7 @@ def run(test: SequentialTest, x: FloatArray, until_s: float, shift_m: float = 0.
     for t in np.arange(0.0, until_s, 2.0).tolist():
         x = x + np.array([2.0, 2.0, 0.0, 0.0]) * np.concatenate([x[:, 2:], np.zeros((n, 2))], axis=1)
         errors = [wander(rng, e) for e in errors]
-        a, b = tracks(np.arange(n), x + errors[0]), tracks(1000 + np.arange(n), x + errors[1] + [shift_m, 0, 0, 0])
+        a, b = tracks(np.arange(n), x + errors[0]), tracks(1000 + np.arange(n), x + errors[1] + shift_m * EAST)
         pairs = declared(test.cycle(a, b, t), a, b)
     return pairs
 
@@ -49,7 +50,7 @@ def test_tracks_of_one_target_are_found_and_no_others() -> None:
 
 def test_pairs_in_formation_are_told_apart_in_time() -> None:
     lead = sky(np.random.default_rng(2), 20)
-    wing = lead + [400.0, 0.0, 0.0, 0.0]
+    wing = lead + 400.0 * EAST
     pairs = run(SequentialTest(PairRules()), np.concatenate([lead, wing]), 40.0)
     right = {(k, 1000 + k) for k in range(40)}
     assert len(pairs & right) >= 38
@@ -64,7 +65,7 @@ def test_a_shift_that_the_errors_cannot_explain_bars_the_pair() -> None:
 
 def test_pairs_are_one_to_one() -> None:
     x = np.zeros((1, 4))
-    test, a, b = SequentialTest(PairRules()), tracks([1], x), tracks([5, 6], np.concatenate([x, x + [30.0, 0, 0, 0]]))
+    test, a, b = SequentialTest(PairRules()), tracks([1], x), tracks([5, 6], np.concatenate([x, x + 30.0 * EAST]))
     for t in (0.0, 2.0, 4.0):
         pairs = test.cycle(a, b, t)
     assert declared(pairs, a, b) == {(1, 5)}
@@ -93,7 +94,7 @@ def test_a_pair_that_parts_is_given_up() -> None:
         pairs = test.cycle(tracks([1], x), tracks([2], x), t)
     assert len(pairs.a) == 1
     for t in np.arange(20.0, 32.0, 2.0).tolist():
-        pairs = test.cycle(tracks([1], x), tracks([2], x + [100.0 * (t - 18.0), 0, 50.0, 0]), t)
+        pairs = test.cycle(tracks([1], x), tracks([2], x + 100.0 * (t - 18.0) * EAST), t)
     assert not len(pairs.a)
 
 

@@ -38,7 +38,7 @@ def frame(n: int = 6, sensors: int = 2, first_id: int = 1, origin: Geodetic | No
 
 
 def selected(query: TrackQuery, of: TrackFrame | None = None) -> list[int]:
-    return frames.select(of or frame(), query).track_id.tolist()
+    return [int(k) for k in frames.select(of or frame(), query).track_id]
 
 
 ALL = [TENTATIVE, CONFIRMED, COASTING]

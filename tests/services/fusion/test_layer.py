@@ -18,7 +18,7 @@ def confirmed_at(bank: Layer, *place: tuple[float, float], until_s: float = 12.0
     for t in np.arange(0.0, until_s + 1, 4.0).tolist():
         done = step(bank, t, *place)
     assert bank.life.confirmed[done.row].all()
-    return done.row.tolist()
+    return [int(row) for row in done.row]
 
 
 def test_unused_plots_start_tracks_that_become_confirmed() -> None:
@@ -46,9 +46,10 @@ def test_a_plot_belongs_to_one_track_and_a_track_takes_one_plot() -> None:
 def test_confirmed_tracks_choose_first() -> None:
     bank = layer()
     row = confirmed_at(bank, (0, 0))[0]
-    # A tentative track is much nearer to the only plot, but that is in the confirmed one's gate as well.
-    step(bank, 16.0, (0, 0), (150, 0))
-    done = step(bank, 20.0, (150, 0))
+    # A tentative track fits the only plot better, but that is in the confirmed one's gate as well.
+    for t in (16.0, 20.0):
+        assert step(bank, t, (0, 0), (350, 0)).row[0] == row
+    done = step(bank, 24.0, (350, 0))
     assert done.row.tolist() == [row]
 
 

@@ -24,9 +24,7 @@ def hit(life: Life, t_s: float, gain: float = 5.0, sensor: int = 0) -> None:
 def miss(life: Life, t_s: float, *, whole: bool = True, lately_s: float = np.inf, east_m: float = 1e4) -> bool:
     """Judge a look of sensor 0 with a period of 4 s at row 0; whether it was a miss."""
     before, mean = life.misses[0], np.array([[east_m, 0.0, 100.0, 0.0]] * len(life.uid))
-    lives.miss(
-        life, ROW, mean, np.zeros(len(life.uid)), t_s, 0, np.zeros(2), 12e3, lately_s, 4.0, 0.5, whole, LOG_MISS
-    )
+    lives.miss(life, ROW, mean, np.zeros(len(life.uid)), t_s, 0, np.zeros(2), 12e3, lately_s, 4.0, 0.5, whole, LOG_MISS)
     return bool(life.misses[0] > before)
 
 

@@ -23,7 +23,7 @@ def linked(uids: list[int], links: list[int], counts: list[int]) -> Layer:
 
 
 def members(system: Layer, sensor: int = 0) -> list[int]:
-    return system.life.member[system.rows, sensor].tolist()
+    return [int(uid) for uid in system.life.member[system.rows, sensor]]
 
 
 def test_two_shared_plots_make_a_member() -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pymap3d
 import pytest
@@ -19,7 +21,9 @@ AWAY_DEG = (50.6, 9.1, 300.0)
 # --- placing plots ---
 
 
-def polar(azimuth_deg: FloatArray, range_m: FloatArray, elevation_deg: FloatArray | None = None) -> tuple[FloatArray, list[str]]:
+def polar(
+    azimuth_deg: FloatArray, range_m: FloatArray, elevation_deg: FloatArray | None = None
+) -> tuple[FloatArray, list[str]]:
     columns = [range_m, np.radians(azimuth_deg)]
     names = POLAR
     if elevation_deg is not None:
@@ -122,7 +126,7 @@ def test_range_rate_is_no_elevation() -> None:
         ("no_origin", {"sigma": {"latitude_deg": 1.0, "longitude_deg": 1.0}}, GEODETIC),
     ],
 )
-def test_plots_that_cannot_be_placed_are_refused(reason: str, change: dict[str, object], columns: list[str]) -> None:
+def test_plots_that_cannot_be_placed_are_refused(reason: str, change: dict[str, Any], columns: list[str]) -> None:
     sensor = Sensor(0, position_sensor(**change), None)
     with pytest.raises(RefusedMessage) as error:
         sensor.plane(batch("ais", 0.0, np.zeros((1, 2)), columns))

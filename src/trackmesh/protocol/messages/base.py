@@ -25,6 +25,7 @@ UnixNs = Annotated[int, Field(ge=0, le=2**63 - 1)]
 """UTC nanoseconds since 1970-01-01."""
 
 Seq = Annotated[int, Field(ge=0, le=2**63 - 1)]
+Count = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -62,21 +63,40 @@ class Message(BaseModel):
     @model_validator(mode="after")
     def _equal_axes(self) -> Self:
         length: dict[str, int] = {}
+        empty = 0
         for field, axes in self._axes:
             value = getattr(self, field)
             if value is None:
                 continue
             shape = value.shape if isinstance(value, np.ndarray) else (len(value),)
-            # An array without rows came from JSON as []: its other axes are unknown, not wrong.
-            known = 1 if shape[0] == 0 else len(shape)
-            for axis, got in zip(axes[:known], shape[:known], strict=True):
+            for axis, got in zip(axes, shape, strict=True):
                 if isinstance(axis, str) and length.setdefault(axis, got) != got:
-                    raise PydanticCustomError(
-                        "wrong_length",
-                        "{field} has {got} along its axis {axis}, where {want} are needed",
-                        {"field": field, "axis": axis, "got": got, "want": length[axis]},
-                    )
+                    raise _unequal(field, axis, got, length[axis])
+                if got == 0:
+                    # What has no rows came from JSON as []: its other axes are unknown.
+                    empty += len(shape) > 1
+                    break
+        if empty:
+            self._complete_empty(length)
         return self
+
+    def _complete_empty(self, length: dict[str, int]) -> None:
+        """Give arrays without rows the other axes that the message gives them."""
+        for field, axes in self._axes:
+            value = getattr(self, field)
+            if not isinstance(value, np.ndarray) or value.size:
+                continue
+            whole = tuple(length.get(a, n) if isinstance(a, str) else n for a, n in zip(axes, value.shape, strict=True))
+            for axis, got, want in zip(axes, value.shape, whole, strict=True):
+                if got not in (0, want):
+                    raise _unequal(field, str(axis), got, want)
+            self._make_empty(field, whole)
+
+    def _make_empty(self, field: str, shape: tuple[int, ...]) -> None:
+        array = np.zeros(shape, getattr(self, field).dtype)
+        array.flags.writeable = False
+        # The message is frozen for others only.
+        self.__dict__[field] = array
 
     def __eq__(self, other: object) -> bool:
         if type(self) is not type(other):
@@ -89,6 +109,9 @@ class Message(BaseModel):
 class TopMessage(Message):
     """A message that travels by itself: it has a schema id and a version."""
 
+    most_bytes: ClassVar[int] = 64 * 2**20
+    """Larger ones are refused unread."""
+
     schema_version: Annotated[int, Field(ge=1, le=1)] = 1
 
     @classmethod
@@ -97,7 +120,15 @@ class TopMessage(Message):
         return f"trackmesh.{cls.__name__}.v1"
 
 
+def _unequal(field: str, axis: str, got: int, want: int) -> PydanticCustomError:
+    return PydanticCustomError(
+        "wrong_length",
+        "{field} has {got} along its axis {axis}, where {want} are needed",
+        {"field": field, "axis": axis, "got": got, "want": want},
+    )
+
+
 def _equal(a: Any, b: Any) -> bool:
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        return isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and np.array_equal(a, b)
+        return isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and np.array_equal(a, b, equal_nan=True)
     return bool(a == b)

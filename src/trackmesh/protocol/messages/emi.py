@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError, core_schema
 
 from trackmesh.protocol.arrays import AnyArray, ArrayField, FloatArray
-from trackmesh.protocol.messages.base import Finite, Id, Message, NonNegative, Positive, Probability, TopMessage
+from trackmesh.protocol.messages.base import Count, Finite, Id, Message, NonNegative, Positive, Probability, TopMessage
 
 Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 Length = Annotated[float, Field(gt=0, le=1e3, allow_inf_nan=False)]
@@ -18,18 +18,20 @@ COMPONENTS = {"xyz": 3, "z": 1}
 
 
 class GappyField(ArrayField):
-    """An array whose elements may be missing: NaN or infinite in msgpack, null in JSON.
+    """An array whose elements may be missing: NaN or infinite in msgpack, null in JSON; NaN in memory.
 
     A sensor loses samples, and one broken scan must not have its whole batch refused.
     """
 
-    def _parse(self, value: Any) -> AnyArray:
-        if isinstance(value, list):
-            try:
-                value = np.array(value, np.float64)
-            except (ValueError, TypeError):
-                raise PydanticCustomError("wrong_type", "a list must hold numbers or null, rows equally long") from None
-        return super()._parse(value)
+    also = (type(None),)
+
+    def validate(self, value: Any) -> AnyArray:
+        """As any array, with NaN for what is missing."""
+        array = super().validate(value)
+        if np.isinf(array).any():
+            array = np.where(np.isfinite(array), array, np.nan)
+            array.flags.writeable = False
+        return array
 
     def _check_values(self, array: AnyArray) -> None:
         pass
@@ -119,7 +121,7 @@ class EmiScanBatch(TopMessage):
     geometry: EmiGeometry
     field: Annotated[FloatArray, GappyField("<f8", ("b", "c", "w", "k"))]
     field_unit: Literal["T", "nT", "pT", "arbitrary"]
-    sigma: Positive | list[Positive] | None = None
+    sigma: Positive | Annotated[list[Positive], Field(max_length=3)] | None = None
     sigma_factor: Annotated[FloatArray, ArrayField("<f8", ("w",), ge=1e-9, le=1e9)] | None = None
     options: EmiOptions = EmiOptions()
 
@@ -174,16 +176,16 @@ class EmiResult(TopMessage):
     """
 
     batch_id: Id
-    index: Annotated[int, Field(ge=0)]
+    index: Count
     status: EmiStatus
-    reasons: list[str] = []
-    targets: list[EmiTarget] = []
+    reasons: Annotated[list[str], Field(max_length=64)] = []
+    targets: Annotated[list[EmiTarget], Field(max_length=64)] = []
     chi2: Finite | None = None
-    dof: int | None = None
+    dof: Count | None = None
     p_value: Probability | None = None
     likelihood_ratio: Finite | None = None
     sigma_used: Finite | None = None
-    n_used: int = 0
-    n_masked: int = 0
-    n_outliers: int = 0
-    iterations: int = 0
+    n_used: Count = 0
+    n_masked: Count = 0
+    n_outliers: Count = 0
+    iterations: Count = 0

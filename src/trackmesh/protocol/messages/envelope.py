@@ -7,12 +7,12 @@ was done.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 from pydantic_core import PydanticCustomError
 
-from trackmesh.protocol.messages.base import TopMessage
+from trackmesh.protocol.messages.base import Count, TopMessage
 
 
 class Envelope(TopMessage):
@@ -23,7 +23,7 @@ class Envelope(TopMessage):
     payload: dict[str, Any] | None = None
     code: str | None = None
     detail: str | None = None
-    count: Annotated[int, Field(ge=0)] | None = None
+    count: Count | None = None
 
     @model_validator(mode="after")
     def _complete(self) -> Self:

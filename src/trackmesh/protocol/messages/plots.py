@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
@@ -11,12 +11,9 @@ from pydantic_core import PydanticCustomError
 from trackmesh.protocol.arrays import ArrayField, Axis, FloatArray, IntArray
 from trackmesh.protocol.messages.base import (
     BootId,
-    Finite,
+    Count,
     Id,
     Message,
-    NonNegative,
-    Positive,
-    Probability,
     Seq,
     TopMessage,
 )
@@ -37,6 +34,9 @@ COLUMN_BOUNDS: dict[str, tuple[float, float]] = {
 }
 """Inclusive bounds of each column a plot may have."""
 
+LARGEST_SIGMA = {"azimuth_rad": math.pi, "elevation_rad": math.pi}
+"""Standard deviations of angles are bounded: beyond half a turn nothing is measured, and formulas overflow."""
+
 COLUMN_SETS: tuple[tuple[str, ...], ...] = (
     ("range_m", "azimuth_rad"),
     ("range_m", "azimuth_rad", "elevation_rad"),
@@ -48,6 +48,11 @@ COLUMN_SETS: tuple[tuple[str, ...], ...] = (
     ("latitude_deg", "longitude_deg", "height_m"),
 )
 """The column sets a batch may have, in this order."""
+
+
+Label = Annotated[str, Field(max_length=64)]
+Coordinate = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
+Sigma = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
 
 
 class Geodetic(Message):
@@ -65,16 +70,18 @@ class SensorInfo(TopMessage):
     geodetic columns in metres east and north. ``clutter_density`` is false plots a look and square metre.
     """
 
+    most_bytes: ClassVar[int] = 4 * 2**20
+
     sensor_id: Id
     kind: Literal["radar", "position", "ranging"]
     site: Geodetic | None = None
-    site_enu_m: Annotated[list[Finite], Field(min_length=3, max_length=3)] | None = None
-    period_s: Positive
+    site_enu_m: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] | None = None
+    period_s: Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)]
     p_detect: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
-    max_range_m: Positive
-    sigma: dict[str, Positive]
-    interference: dict[str, NonNegative] | None = None
-    clutter_density: Positive | None = None
+    max_range_m: Annotated[float, Field(ge=1e-3, le=1e9, allow_inf_nan=False)]
+    sigma: dict[str, Sigma]
+    interference: dict[str, Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]] | None = None
+    clutter_density: Annotated[float, Field(ge=1e-18, le=1e6, allow_inf_nan=False)] | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -85,14 +92,17 @@ class SensorInfo(TopMessage):
         for name in [*self.sigma, *(self.interference or {})]:
             if name not in COLUMN_BOUNDS:
                 raise PydanticCustomError("invalid", "unknown column {name}", {"name": name})
+        for name, most in LARGEST_SIGMA.items():
+            if self.sigma.get(name, 0.0) > most:
+                raise PydanticCustomError("out_of_bounds", "sigma of {name} is above half a turn", {"name": name})
         return self
 
 
 class ScanPart(Message):
     """Which turn, and which slice of it, a batch is."""
 
-    index: Annotated[int, Field(ge=0)]
-    sector: Annotated[int, Field(ge=0)]
+    index: Count
+    sector: Count
     sectors: Annotated[int, Field(ge=1, le=65536)]
 
     @model_validator(mode="after")
@@ -117,7 +127,7 @@ class PlotBatch(TopMessage):
     columns: Annotated[list[str], Axis("c"), Field(min_length=2, max_length=4)]
     values: Annotated[FloatArray, ArrayField("<f8", ("n", "c"))]
     variances: Annotated[FloatArray, ArrayField("<f8", ("n", "c"), ge=1e-18, le=1e18)] | None = None
-    labels: Annotated[list[Annotated[str, Field(max_length=64)]], Axis("n")] | None = None
+    labels: Annotated[list[Label], Axis("n"), Field(max_length=MAX_PLOTS, fail_fast=True)] | None = None
     scan: ScanPart | None = None
 
     @model_validator(mode="after")
@@ -127,8 +137,12 @@ class PlotBatch(TopMessage):
         n = len(self.t_ns)
         if n > MAX_PLOTS:
             raise PydanticCustomError("too_large", "{n} plots, at most {most} allowed", {"n": n, "most": MAX_PLOTS})
-        if n == 0:
-            return self
+        if n:
+            self._check_values()
+            self._check_angles()
+        return self
+
+    def _check_values(self) -> None:
         low, high = self.values.min(axis=0).tolist(), self.values.max(axis=0).tolist()
         for i, name in enumerate(self.columns):
             ge, le = COLUMN_BOUNDS[name]
@@ -136,7 +150,13 @@ class PlotBatch(TopMessage):
                 raise PydanticCustomError(
                     "out_of_bounds", "{name} must lie in [{ge}, {le}]", {"name": name, "ge": ge, "le": le}
                 )
-        return self
+
+    def _check_angles(self) -> None:
+        if self.variances is None:
+            return
+        for name, most in LARGEST_SIGMA.items():
+            if name in self.columns and self.variances[:, self.columns.index(name)].max() > most * most:
+                raise PydanticCustomError("out_of_bounds", "a variance of {name} is above pi^2", {"name": name})
 
 
 __all__ = [
@@ -145,7 +165,6 @@ __all__ = [
     "MAX_PLOTS",
     "Geodetic",
     "PlotBatch",
-    "Probability",
     "ScanPart",
     "SensorInfo",
 ]

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from trackmesh.protocol.messages.base import BootId, Finite, Id, Message, NonNegative, Seq, TopMessage, UnixNs
-
-Count = Annotated[int, Field(ge=0)]
+from trackmesh.protocol.messages.base import BootId, Count, Finite, Id, Message, NonNegative, Seq, TopMessage, UnixNs
 
 
 class SensorHealth(Message):
@@ -33,6 +31,8 @@ class ServiceStatus(TopMessage):
     (``"p50"``, ``"p90"``, ``"p99"``) of the last minute, ``figures`` other present values by name.
     """
 
+    most_bytes: ClassVar[int] = 4 * 2**20
+
     kind: Id
     unit_id: Id
     boot_id: BootId
@@ -44,4 +44,4 @@ class ServiceStatus(TopMessage):
     refused: dict[str, Count] = {}
     latency_ms: dict[str, NonNegative] = {}
     figures: dict[str, Finite] = {}
-    sensors: list[SensorHealth] = []
+    sensors: Annotated[list[SensorHealth], Field(fail_fast=True)] = []

@@ -33,8 +33,8 @@ class RangeBatch(TopMessage):
     boot_id: BootId
     seq: Seq
     t_ns: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0)]
-    tags: Annotated[list[Id], Field(max_length=MAX_RANGES)]
-    readers: Annotated[list[Id], Field(max_length=MAX_RANGES)]
+    tags: Annotated[list[Id], Field(max_length=MAX_RANGES, fail_fast=True)]
+    readers: Annotated[list[Id], Field(max_length=MAX_RANGES, fail_fast=True)]
     tag: Annotated[UInt32Array, ArrayField("<u4", ("n",))]
     reader: Annotated[UInt32Array, ArrayField("<u4", ("n",))]
     range_m: Annotated[FloatArray, ArrayField("<f8", ("n",), ge=-1e3, le=1e6)]
@@ -58,7 +58,7 @@ class TagFrame(TopMessage):
     seq: Seq
     t_ns: UnixNs
     origin: Geodetic | None = None
-    tag_id: Annotated[list[Id], Axis("n")]
+    tag_id: Annotated[list[Id], Axis("n"), Field(fail_fast=True)]
     status: Annotated[UInt8Array, ArrayField("|u1", ("n",), le=3)]
     state: Annotated[FloatArray, ArrayField("<f8", ("n", 6))]
     covariance: Annotated[Float32Array, ArrayField("<f4", ("n", 21))]

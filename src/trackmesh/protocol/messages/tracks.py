@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -17,11 +17,13 @@ from trackmesh.protocol.arrays import (
     UInt8Array,
     UInt32Array,
 )
-from trackmesh.protocol.messages.base import BootId, Finite, Id, Message, NonNegative, Seq, TopMessage, UnixNs
+from trackmesh.protocol.messages.base import BootId, Count, Finite, Id, Message, NonNegative, Seq, TopMessage, UnixNs
 from trackmesh.protocol.messages.plots import Geodetic
 
 TENTATIVE, CONFIRMED, COASTING, ENDED = 0, 1, 2, 3
 """Values of ``TrackFrame.status``."""
+
+TrackId = Annotated[int, Field(ge=0, le=2**53)]
 
 _UPPER = np.triu_indices(6)
 
@@ -49,8 +51,8 @@ class TrackFrame(TopMessage):
     height_m: Annotated[FloatArray, ArrayField("<f8", ("n",))] | None = None
     height_variance_m2: Annotated[FloatArray, ArrayField("<f8", ("n",), ge=0)] | None = None
     model_probability: Annotated[FloatArray, ArrayField("<f8", ("n", "r"), ge=0, le=1)]
-    models: Annotated[list[str], Axis("r")]
-    sensors: Annotated[list[Id], Axis("s")]
+    models: Annotated[list[str], Axis("r"), Field(fail_fast=True)]
+    sensors: Annotated[list[Id], Axis("s"), Field(fail_fast=True)]
     members: Annotated[IntArray, ArrayField("<i8", ("n", "s"), ge=-1)]
     updated_t_ns: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0)]
     first_t_ns: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0)]
@@ -71,7 +73,9 @@ class TrackQuery(TopMessage):
     tracks whose last plot is older.
     """
 
-    track_ids: Annotated[list[int], Field(max_length=100_000)] | None = None
+    most_bytes: ClassVar[int] = 4 * 2**20
+
+    track_ids: Annotated[list[TrackId], Field(max_length=100_000, fail_fast=True)] | None = None
     bbox_enu_m: Annotated[list[Finite], Field(min_length=4, max_length=4)] | None = None
     bbox_deg: Annotated[list[Finite], Field(min_length=4, max_length=4)] | None = None
     status: Annotated[list[Annotated[int, Field(ge=0, le=3)]], Field(max_length=4)] | None = None
@@ -117,8 +121,8 @@ class SensorBias(Message):
     bias: Annotated[FloatArray, ArrayField("<f8", (2,))]
     covariance: Annotated[FloatArray, ArrayField("<f8", (2, 2))]
     locked: bool
-    pairs: Annotated[int, Field(ge=0)]
-    jumps: Annotated[int, Field(ge=0)]
+    pairs: Count
+    jumps: Count
 
 
 class Registration(TopMessage):
@@ -128,4 +132,4 @@ class Registration(TopMessage):
     boot_id: BootId
     seq: Seq
     t_ns: UnixNs
-    sensors: list[SensorBias]
+    sensors: Annotated[list[SensorBias], Field(fail_fast=True)]

@@ -21,6 +21,9 @@ class TruthFrame(TopMessage):
 
     @model_validator(mode="after")
     def _columns(self) -> Self:
-        if len(self.id) and self.state.shape[1] not in (4, 6):
+        if len(self.id) == 0:
+            # JSON does not tell how many columns nothing has.
+            self._make_empty("state", (0, 4))
+        elif self.state.shape[1] not in (4, 6):
             raise PydanticCustomError("wrong_length", "state must have 4 or 6 columns")
         return self

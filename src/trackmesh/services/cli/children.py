@@ -19,9 +19,10 @@ _STOP_S = 8.0
 
 
 class Children:
-    """Processes ``python -m trackmesh.services.cli.main ...``, ended at the end of the block, last one first.
+    """Commands of ``trackmesh`` as processes, ended at the end of the block, the first one last.
 
-    Each has a session of its own, so that Ctrl-C reaches only us, and its log in ``folder``.
+    Each has a session of its own, so that Ctrl-C reaches only us, and its log in ``folder``. If we are killed they end
+    by themselves: see ``child``.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -30,10 +31,10 @@ class Children:
 
     def start(self, name: str, arguments: Sequence[str]) -> None:
         """Start a command of ``trackmesh``."""
-        command = [sys.executable, "-m", "trackmesh.services.cli.main", *arguments]
+        command = [sys.executable, "-m", "trackmesh.services.cli.child", *arguments]
         with (self.folder / f"{name}.log").open("wb") as log:
             process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+                command, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
             )
         self._running.append((name, process))
 
@@ -50,17 +51,16 @@ class Children:
 
     def stop(self) -> list[str]:
         """End all; the names of those that did not end well."""
-        for _, process in self._running:
-            _signal(process, signal.SIGTERM)
-        deadline, bad = time.monotonic() + _STOP_S, []
-        for name, process in reversed(self._running):
-            try:
-                code = process.wait(max(0.1, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                _signal(process, signal.SIGKILL)
-                code = process.wait()
-            if code != 0:
-                bad.append(f"{name} ({code})")
+        bad = []
+        # The first one is what the others speak through.
+        for group in (self._running[:0:-1], self._running[:1]):
+            deadline = time.monotonic() + _STOP_S
+            for _, process in group:
+                _signal(process, signal.SIGTERM)
+            for name, process in group:
+                code = _ended(process, deadline)
+                if code != 0:
+                    bad.append(f"{name} ({code})")
         self._running = []
         return bad
 
@@ -73,6 +73,18 @@ class Children:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.stop()
+
+
+def _ended(process: subprocess.Popen[bytes], deadline_s: float) -> int:
+    """The exit code, if need be that of a process that is killed at the deadline."""
+    try:
+        code = process.wait(max(0.1, deadline_s - time.monotonic()))
+    except subprocess.TimeoutExpired:
+        _signal(process, signal.SIGKILL)
+        code = process.wait()
+    if process.stdin is not None:
+        process.stdin.close()
+    return code
 
 
 def _signal(process: subprocess.Popen[bytes], number: int) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import random
 import socket
 import threading
 import time
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, nullcontext, suppress
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -20,7 +21,8 @@ from trackmesh.protocol.zenoh_bus import ZenohBus
 from trackmesh.services.cli.children import Children
 from trackmesh.services.cli.demo_view import DemoState, demo_panel, demo_report, watch_truth
 from trackmesh.services.cli.files import records_of
-from trackmesh.services.cli.options import err, fail, out, told
+from trackmesh.services.cli.options import Scenario as ScenarioOption
+from trackmesh.services.cli.options import Seed, err, fail, out, say, told
 from trackmesh.services.process import on_signal
 from trackmesh.sim.drawing import draw_tracks
 from trackmesh.sim.emi import scenario_scans
@@ -28,76 +30,102 @@ from trackmesh.sim.scenario import Scenario, load_scenario
 
 TRACKS, TRUTH = "tracks.jsonl", "truth.jsonl"
 
+_ROUTER_S = 60.0
 _READY_S = 240.0
+_TELL_S = 5.0
 _ENDED_WELL = 0.95
+_LONG_ENOUGH_S = 45.0
 
 
 @told
 def demo(
-    seconds: Annotated[float, typer.Option("--seconds", help="How long; 0: until Ctrl-C.")] = 60.0,
-    scenario: Annotated[str, typer.Option("--scenario", help="A scenario's name, or a TOML file.")] = "two-radars",
-    seed: Annotated[int, typer.Option("--seed", help="Everything random follows from it.")] = 1,
+    seconds: Annotated[float, typer.Option("--seconds", min=0.0, metavar="S", help="How long; 0: until Ctrl-C.")] = 60,
+    scenario: ScenarioOption = "two-radars",
+    seed: Seed = 1,
     out_path: Annotated[
-        Path, typer.Option("--out", help="Folder for the picture, the recordings and the logs.")
+        Path, typer.Option("--out", metavar="FOLDER", help="For the picture, the recordings and the logs.")
     ] = Path("out/demo"),
-    port: Annotated[int | None, typer.Option("--port", help="Port of the router; default: a free one.")] = None,
+    port: Annotated[
+        int | None, typer.Option("--port", min=1, max=65535, metavar="N", help="Of the router; default: a free one.")
+    ] = None,
 ) -> None:
-    """Run router, two radars, fusion and EMI as processes on this machine, and watch them."""
+    """Run the whole system on this machine, and watch it.
+
+    A router, simulated radars, a fusion unit and an EMI service run as processes of their own. At the end the picture
+    is compared with the truth: the exit code is 1 if a process failed, or if, after 45 s or more, fewer than 95 % of
+    the targets in coverage have exactly one track.
+    """
     world = load_scenario(scenario)
     folder = _folder(out_path)
     stop = threading.Event()
     with on_signal(lambda _: stop.set()), Children(folder) as children:
-        endpoint = f"tcp/127.0.0.1:{port or _free_port()}"
-        state = _run(scenario, seed, seconds, endpoint, folder, children, stop)
+        state = _run(Setting(world, scenario, seed, folder, port or _free_port()), seconds, children, stop)
         bad = children.stop()
+    if not state.frames and stop.is_set():
+        say(f"stopped before the first picture; logs in {folder}")
+        return
     report = demo_report(state, world, seed)
     out.print(report.table)
     draw_tracks(
         records_of(folder / TRACKS, TrackFrame), records_of(folder / TRUTH, TruthFrame), out=folder / "tracks.png"
     )
-    err.print(f"picture, recordings and logs in {folder}", highlight=False)
-    if report.error:
-        fail(report.error)
+    say(f"picture, recordings and logs in {folder}")
     if bad:
         fail(f"These processes did not end well: {', '.join(bad)}.")
-    if seconds >= 45 and not stop.is_set() and not report.share >= _ENDED_WELL:
+    if stop.is_set():
+        return
+    if report.error:
+        fail(report.error)
+    if seconds >= _LONG_ENOUGH_S and not report.share >= _ENDED_WELL:
         fail(f"Only {report.share:.0%} of the targets in coverage have exactly one track.")
 
 
-def _run(
-    scenario: str,
-    seed: int,
-    seconds: float,
-    endpoint: str,
-    folder: Path,
-    children: Children,
-    stop: threading.Event,
-) -> DemoState:
-    world, state = load_scenario(scenario), DemoState(seconds)
-    to = ["--connect", endpoint]
+class Setting(NamedTuple):
+    """What is shown, and where: the world, the scenario's name or file, its seed, the folder, the router's port."""
+
+    world: Scenario
+    scenario: str
+    seed: int
+    folder: Path
+    port: int
+
+
+def _run(setting: Setting, seconds: float, children: Children, stop: threading.Event) -> DemoState:
+    state = DemoState(seconds)
+    endpoint = f"tcp/127.0.0.1:{setting.port}"
     children.start("router", ["router", "--listen", endpoint])
-    children.start("fusion", ["fusion", *to, "--black-box", str(folder / "black-box.jsonl")])
-    children.start("emi", ["emi", *to])
+    children.start("fusion", ["fusion", "--connect", endpoint, "--black-box", str(setting.folder / "black-box.jsonl")])
+    children.start("emi", ["emi", "--connect", endpoint])
+    _wait_router(children, setting.port, stop)
+    if stop.is_set():
+        return state
     with ZenohBus.open([endpoint], timeout_s=30.0, stop=stop) as bus, ExitStack() as stack:
         ask = Client(bus)
         watched = Watched(
             frames=stack.enter_context(ask.watch_tracks(history=False)),
             statuses=stack.enter_context(ask.watch_statuses()),
             truth=stack.enter_context(watch_truth(bus, ask.keys)),
-            track_file=stack.enter_context(RecordWriter(folder / TRACKS)),
-            truth_file=stack.enter_context(RecordWriter(folder / TRUTH)),
+            track_file=stack.enter_context(RecordWriter(setting.folder / TRACKS)),
+            truth_file=stack.enter_context(RecordWriter(setting.folder / TRUTH)),
         )
         _wait_ready(children, watched, stop)
-        common = ["--scenario", scenario, "--seed", str(seed), "--start-ns", str(time.time_ns()), *to]
-        for radar in world.radars:
-            children.start(f"radar-{radar.id}", ["sim", "radar", "--radar", radar.id, *common])
-        children.start("truth", ["sim", "truth", *common])
-        asking = threading.Thread(target=_ask_emi, args=(ask, world, seed, state), daemon=True)
+        if stop.is_set():
+            return state
+        _start_sensors(children, setting, endpoint)
+        asking = threading.Thread(target=_ask_emi, args=(ask, setting, state), daemon=True)
         asking.start()
         state.begin()
         _watch(children, watched, state, stop)
         asking.join(10.0)
     return state
+
+
+def _start_sensors(children: Children, setting: Setting, endpoint: str) -> None:
+    begin = ["--start-ns", str(time.time_ns()), "--connect", endpoint]
+    common = ["--scenario", setting.scenario, "--seed", str(setting.seed), *begin]
+    for radar in setting.world.radars:
+        children.start(f"radar-{radar.id}", ["sim", "radar", "--radar", radar.id, *common])
+    children.start("truth", ["sim", "truth", *common])
 
 
 class Watched(NamedTuple):
@@ -127,27 +155,42 @@ def _watch(children: Children, watched: Watched, state: DemoState, stop: threadi
                 live.update(demo_panel(state), refresh=True)
 
 
+def _wait_router(children: Children, port: int, stop: threading.Event) -> None:
+    """Wait until the router listens, so that nobody has to complain that it does not yet."""
+    deadline = time.monotonic() + _ROUTER_S
+    while not stop.wait(0.05):
+        children.check()
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        if time.monotonic() > deadline:
+            raise TrackmeshError(f"The router did not listen within {_ROUTER_S:g} s.")
+
+
 def _wait_ready(children: Children, watched: Watched, stop: threading.Event) -> None:
     """Wait until fusion and EMI are ready; the first start on a machine compiles for up to a minute."""
-    missing, deadline = {"fusion", "emi"}, time.monotonic() + _READY_S
-    text = "starting; the first start on a machine compiles the numerics, which takes about a minute"
-    with err.status(text) if err.is_terminal else nullcontext():
-        if not err.is_terminal:
-            err.print(text, highlight=False)
+    missing, began_s = {"fusion", "emi"}, time.monotonic()
+    text = "the first start on a machine compiles the numerics, which takes about a minute"
+    tell = not err.is_terminal
+    with err.status(f"starting; {text}") if err.is_terminal else nullcontext():
         while missing and not stop.is_set():
             children.check()
             status = watched.statuses.receive(0.2)
             if status is not None and status.state == "ready":
                 missing.discard(status.kind)
-            if time.monotonic() > deadline:
+            waited_s = time.monotonic() - began_s
+            if waited_s > _READY_S:
                 raise TrackmeshError(f"These services were not ready in time: {', '.join(sorted(missing))}.")
+            if tell and waited_s > _TELL_S:
+                say(text)
+                tell = False
 
 
-def _ask_emi(ask: Client, world: Scenario, seed: int, state: DemoState) -> None:
-    if world.emi is None:
+def _ask_emi(ask: Client, setting: Setting, state: DemoState) -> None:
+    if setting.world.emi is None:
         return
     try:
-        simulated = scenario_scans(world.emi, seed)
+        simulated = scenario_scans(setting.world.emi, setting.seed)
         state.emi = list(ask.invert(simulated.batch))
         state.emi_truth_m = simulated.truth.position_m
     except TrackmeshError as error:
@@ -163,6 +206,12 @@ def _folder(path: Path) -> Path:
 
 
 def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """A port nobody listens at, below those that the kernel gives to outgoing connections.
+
+    Who tries to connect to one of those before the router listens may be given that very port, and then occupies it.
+    """
+    while True:
+        port = random.randrange(20_000, 32_000)
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port

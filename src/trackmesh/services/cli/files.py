@@ -14,12 +14,12 @@ from rich.table import Table
 from trackmesh.protocol.errors import TrackmeshError
 from trackmesh.protocol.files import RecordWriter, read_records
 from trackmesh.protocol.messages import MESSAGES, Message, TrackFrame, TruthFrame
-from trackmesh.services.cli.options import AsJson, Config, err, out, told
+from trackmesh.services.cli.options import AsJson, Config, err, out, say, told
 from trackmesh.services.cli.progress import progress_bar
 
 M = TypeVar("M", bound=Message)
 
-Tracks = Annotated[Path, typer.Argument(help="TRACKS.jsonl")]
+Tracks = Annotated[Path, typer.Argument(metavar="TRACKS.jsonl", help="As written by track, or watch --out.")]
 
 convert = typer.Typer(help="Turn a recording in another format into PLOTS.jsonl.", no_args_is_help=True)
 
@@ -33,11 +33,11 @@ def records_of(path: Path, kind: type[M]) -> Iterator[M]:
 
 @told
 def track(
-    plots: Annotated[Path, typer.Argument(help="PLOTS.jsonl, or a black box.")],
-    out_path: Annotated[Path, typer.Option("--out", help="TRACKS.jsonl to write.")],
+    plots: Annotated[Path, typer.Argument(metavar="PLOTS.jsonl", help="A recording, or a black box.")],
+    out_path: Annotated[Path, typer.Option("--out", metavar="TRACKS.jsonl", help="File to write.")],
     config: Config = None,
 ) -> None:
-    """Run the fusion engine over a recording, without a network: the same frames as live."""
+    """Track a recording, without a network. The same engine as live, and the same frames."""
     from trackmesh.services.fusion.offline import OfflineRun
     from trackmesh.services.fusion.settings import FusionSettings
 
@@ -50,10 +50,7 @@ def track(
             count += 1
     spent_s = time.process_time() - started_s
     refused = ", ".join(f"{n} refused: {reason}" for reason, n in sorted(run.refused.items()))
-    err.print(
-        f"{count} frames of {run.plots} plots in {out_path}, {spent_s:.1f} s of CPU{'; ' + refused if refused else ''}",
-        highlight=False,
-    )
+    say(f"{count} frames of {run.plots} plots in {out_path}, {spent_s:.1f} s of CPU{'; ' + refused if refused else ''}")
 
 
 def _counted(records: Iterator[Message], advance: Callable[[float], None]) -> Iterator[Message]:
@@ -75,15 +72,19 @@ def _lines(path: Path) -> int | None:
 @told
 def score(
     tracks: Tracks,
-    truth: Annotated[Path, typer.Argument(help="TRUTH.jsonl")],
+    truth: Annotated[Path, typer.Argument(metavar="TRUTH.jsonl", help="Where the targets really were.")],
     as_json: AsJson = False,
-    c_m: Annotated[float, typer.Option("--c", help="Cut-off distance of GOSPA and OSPA, metres.")] = 1000.0,
-    warmup_s: Annotated[float, typer.Option("--warmup", help="Seconds not scored at the start.")] = 40.0,
+    c_m: Annotated[
+        float, typer.Option("--c", min=1e-3, metavar="M", help="Cut-off distance of GOSPA and OSPA, metres.")
+    ] = 1000.0,
+    warmup_s: Annotated[
+        float, typer.Option("--warmup", min=0.0, metavar="S", help="Seconds not scored at the start.")
+    ] = 40.0,
     nearest: Annotated[
         bool, typer.Option("--nearest", help="Score the nearest track of each target: for truth of some targets only.")
     ] = False,
 ) -> None:
-    """Score tracks against the truth: GOSPA, OSPA, RMSE, NEES, identity switches."""
+    """Score tracks against the truth. By GOSPA, OSPA, RMSE, NEES and identity switches."""
     from trackmesh.sim.scoring import score_nearest, score_tracks
 
     if nearest:
@@ -106,12 +107,18 @@ def score(
 @told
 def plot(
     tracks: Tracks,
-    truth: Annotated[Path | None, typer.Argument(help="TRUTH.jsonl")] = None,
-    out_path: Annotated[Path, typer.Option("--out", help="Picture to write: .png, .svg or .pdf.")] = Path("tracks.png"),
-    plots: Annotated[Path | None, typer.Option("--plots", help="PLOTS.jsonl, drawn as dots.")] = None,
-    title: Annotated[str | None, typer.Option("--title")] = None,
+    truth: Annotated[Path | None, typer.Argument(metavar="TRUTH.jsonl", help="Where the targets really were.")] = None,
+    out_path: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help="Picture to write: .png, .svg or .pdf.")
+    ] = Path("tracks.png"),
+    plots: Annotated[
+        Path | None, typer.Option("--plots", metavar="PLOTS.jsonl", help="A recording, drawn as dots.")
+    ] = None,
+    title: Annotated[
+        str | None, typer.Option("--title", metavar="TEXT", help="Over the picture; default: what it shows.")
+    ] = None,
 ) -> None:
-    """Draw tracks over the truth."""
+    """Draw tracks, over the truth."""
     from trackmesh.sim.drawing import draw_tracks
 
     draw_tracks(
@@ -121,28 +128,35 @@ def plot(
         out=out_path,
         title=title,
     )
-    err.print(f"picture in {out_path}", highlight=False)
+    say(f"picture in {out_path}")
 
 
 @convert.command("autoferry")
 @told
 def convert_autoferry(
     detections: Annotated[
-        Path, typer.Argument(help="scenarioN_detections.json; scenarioN_groundTruth.json beside it.")
+        Path,
+        typer.Argument(
+            metavar="DETECTIONS.json", help="scenarioN_detections.json; scenarioN_groundTruth.json beside it."
+        ),
     ],
-    out_path: Annotated[Path, typer.Option("--out", help="PLOTS.jsonl to write.")],
-    truth: Annotated[Path | None, typer.Option("--truth", help="TRUTH.jsonl to write.")] = None,
+    out_path: Annotated[Path, typer.Option("--out", metavar="PLOTS.jsonl", help="File to write.")],
+    truth: Annotated[Path | None, typer.Option("--truth", metavar="TRUTH.jsonl", help="File to write.")] = None,
 ) -> None:
-    """Convert a recording of the Autoferry sensor fusion dataset: radar and lidar as two sensors."""
+    """Autoferry sensor fusion dataset. Radar and lidar become two sensors."""
     from trackmesh.sim.autoferry import convert_autoferry as work
 
     batches, plots = work(detections, out_path, truth)
-    err.print(f"{plots} plots in {batches} batches in {out_path}", highlight=False)
+    say(f"{plots} plots in {batches} batches in {out_path}")
 
 
 @told
-def schema(name: Annotated[str | None, typer.Argument(help="A message: PlotBatch; default: all.")] = None) -> None:
-    """Print the JSON Schema of a message, or of all of them."""
+def schema(
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="A message, such as PlotBatch; default: all.")
+    ] = None,
+) -> None:
+    """Print the JSON Schema of the messages."""
     by_name = {kind.__name__: kind for kind in MESSAGES.values()}
     if name is None:
         schemas = {ident: kind.model_json_schema() for ident, kind in MESSAGES.items()}

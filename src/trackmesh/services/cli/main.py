@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
+from importlib.metadata import version
+from typing import Annotated
+
 import typer
 
 from trackmesh.services.cli import files, network, services
 from trackmesh.services.cli.demo import demo
 
-app = typer.Typer(
-    help="trackmesh: many sensors, one picture, over Zenoh.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"trackmesh {version('trackmesh')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _top(
+    _: Annotated[
+        bool, typer.Option("--version", help="Say which version this is, and exit.", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Many sensors, one picture of tracks, over Zenoh.
+
+    Settings come from flags, else from TRACKMESH_* in the environment, else from the file given by --config.
+    """
+
 
 for command in (
     demo,

@@ -9,35 +9,53 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from pydantic import ValidationError
 from rich.live import Live
-from rich.table import Table
 
 from trackmesh.protocol.client import Client
-from trackmesh.protocol.errors import TrackmeshError
+from trackmesh.protocol.codec import refusal
 from trackmesh.protocol.files import RecordWriter, read_records, to_line
 from trackmesh.protocol.messages import EmiResult, EmiScanBatch, TrackFrame, TrackQuery
-from trackmesh.services.cli.options import AsJson, Config, Connect, Realm, client, err, out, told
+from trackmesh.services.cli.options import (
+    AsJson,
+    Config,
+    Connect,
+    Realm,
+    Unit,
+    client,
+    corners,
+    instant_ns,
+    out,
+    say,
+    told,
+)
 from trackmesh.services.cli.playback import play_records
 from trackmesh.services.cli.progress import progress_bar
-from trackmesh.services.cli.tables import sensor_table, status_table, track_table
+from trackmesh.services.cli.tables import result_table, sensor_table, status_table, track_table
 from trackmesh.services.process import on_signal
-
-Unit = Annotated[str, typer.Option("--unit", help="One unit only.")]
 
 
 @told
 def watch(
     unit: Unit = "*",
     as_json: AsJson = False,
-    out_path: Annotated[Path | None, typer.Option("--out", help="Write the frames to TRACKS.jsonl.")] = None,
-    seconds: Annotated[float | None, typer.Option("--seconds", help="Stop after this time.")] = None,
+    out_path: Annotated[
+        Path | None, typer.Option("--out", metavar="TRACKS.jsonl", help="Write the frames to a file.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", min=0.0, metavar="S", help="Stop after this time.")
+    ] = None,
     config: Config = None,
     connect: Connect = None,
     realm: Realm = None,
 ) -> None:
-    """Follow the tracks as they are published."""
+    """Follow the tracks as they are published.
+
+    On a terminal as a table; into a pipe, unless there is --out, as JSON lines.
+    """
+    as_json = as_json or not (out.is_terminal or out_path)
     stop = threading.Event()
-    deadline_s = time.monotonic() + seconds if seconds else float("inf")
+    deadline_s = float("inf") if seconds is None else time.monotonic() + seconds
     with client(connect, realm, config) as ask, on_signal(lambda _: stop.set()):
         writer = RecordWriter(out_path) if out_path else None
         try:
@@ -65,25 +83,34 @@ def _show(frame: TrackFrame, as_json: bool, live: Live) -> None:
 def tracks(
     unit: Unit = "*",
     as_json: AsJson = False,
-    bbox: Annotated[str | None, typer.Option("--bbox", help="East, north, east, north in metres: two corners.")] = None,
-    bbox_deg: Annotated[str | None, typer.Option("--bbox-deg", help="Latitude, longitude of two corners.")] = None,
-    at: Annotated[
-        float | None, typer.Option("--at", help="Predict to this Unix time in seconds; +5: from now.")
+    bbox: Annotated[
+        str | None, typer.Option("--bbox", metavar="E,N,E,N", help="Two corners, metres east and north.")
     ] = None,
-    track_id: Annotated[list[int] | None, typer.Option("--id", help="These tracks only.")] = None,
-    max_age_s: Annotated[float | None, typer.Option("--max-age", help="Seconds since the last plot.")] = None,
+    bbox_deg: Annotated[
+        str | None, typer.Option("--bbox-deg", metavar="LAT,LON,LAT,LON", help="Two corners, degrees.")
+    ] = None,
+    at: Annotated[
+        str | None, typer.Option("--at", metavar="S", help="Predict to this Unix time in seconds; +5: 5 s from now.")
+    ] = None,
+    track_id: Annotated[list[int] | None, typer.Option("--id", metavar="ID", help="This track; repeatable.")] = None,
+    max_age_s: Annotated[
+        float | None, typer.Option("--max-age", min=0.0, metavar="S", help="Seconds since the last plot, at most.")
+    ] = None,
     config: Config = None,
     connect: Connect = None,
     realm: Realm = None,
 ) -> None:
-    """Ask for the present picture, or for what it will be."""
-    query = TrackQuery(
-        track_ids=track_id or None,
-        bbox_enu_m=_numbers(bbox, 4),
-        bbox_deg=_numbers(bbox_deg, 4),
-        max_age_s=max_age_s,
-        at_t_ns=None if at is None else round(at * 1e9),
-    )
+    """Ask for the picture, as it is or as it will be."""
+    try:
+        query = TrackQuery(
+            track_ids=track_id or None,
+            bbox_enu_m=corners(bbox, "--bbox"),
+            bbox_deg=corners(bbox_deg, "--bbox-deg"),
+            max_age_s=max_age_s,
+            at_t_ns=instant_ns(at, "--at"),
+        )
+    except ValidationError as error:
+        raise refusal("TrackQuery", error) from None
     with client(connect, realm, config) as ask:
         frames = ask.query_tracks(query, unit)
     if as_json:
@@ -106,7 +133,10 @@ def sensors(as_json: AsJson = False, config: Config = None, connect: Connect = N
 
 @told
 def status(as_json: AsJson = False, config: Config = None, connect: Connect = None, realm: Realm = None) -> None:
-    """Show how every service is: rates, refusals by reason, latency, the sensors it hears."""
+    """Show how every service is.
+
+    What it counted, what it refused and why, its latency, and the sensors it hears.
+    """
     with client(connect, realm, config) as ask:
         found = ask.statuses()
     if as_json:
@@ -117,8 +147,11 @@ def status(as_json: AsJson = False, config: Config = None, connect: Connect = No
 
 @told
 def play(
-    plots: Annotated[Path, typer.Argument(help="PLOTS.jsonl")],
-    speed: Annotated[float, typer.Option("--speed", help="1: as fast as it happened; 0: as fast as possible.")] = 1.0,
+    plots: Annotated[Path, typer.Argument(metavar="PLOTS.jsonl", help="A recording.")],
+    speed: Annotated[
+        float,
+        typer.Option("--speed", min=0.0, metavar="X", help="1: as fast as it happened; 0: as fast as possible."),
+    ] = 1.0,
     keep_time: Annotated[
         bool, typer.Option("--keep-time", help="Keep the recorded times; fusion then needs --clock data.")
     ] = False,
@@ -126,25 +159,30 @@ def play(
     connect: Connect = None,
     realm: Realm = None,
 ) -> None:
-    """Publish a recording as its sensors did; at another speed than 1 fusion needs --clock data."""
+    """Publish a recording as its sensors did.
+
+    At another speed than 1 the recorded times are kept, and fusion needs --clock data.
+    """
     stop = threading.Event()
     with client(connect, realm, config) as ask, on_signal(lambda _: stop.set()):
         sent = play_records(ask.bus, ask.keys, list(read_records(plots)), speed, keep_time or speed != 1.0, stop)
-    err.print(f"{sent} batches published", highlight=False)
+    say(f"{sent} batches published")
 
 
 @told
 def invert(
-    scans: Annotated[Path, typer.Argument(help="SCANS.jsonl")],
+    scans: Annotated[Path, typer.Argument(metavar="SCANS.jsonl", help="Batches of scans.")],
     as_json: AsJson = False,
     local: Annotated[bool, typer.Option("--local", help="Compute here, ask no service.")] = False,
-    out_path: Annotated[Path | None, typer.Option("--out", help="Write the results as JSON lines.")] = None,
+    out_path: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Write the results as JSON lines.")
+    ] = None,
     unit: Unit = "*",
     config: Config = None,
     connect: Connect = None,
     realm: Realm = None,
 ) -> None:
-    """Ask the EMI service where the targets of a batch of scans are."""
+    """Ask the EMI service where the buried targets are."""
     batches = [record for record in read_records(scans, EmiScanBatch) if isinstance(record, EmiScanBatch)]
     if local:
         results = [result for batch in batches for result in _invert_here(batch)]
@@ -182,48 +220,3 @@ def _invert_here(batch: EmiScanBatch) -> list[EmiResult]:
             results.append(to_message(batch, result))
             advance(len(results))
     return results
-
-
-def result_table(results: list[EmiResult]) -> Table:
-    """One row a scan."""
-    table = Table(title=f"{len(results)} scans", title_justify="left")
-    for name in (
-        "scan",
-        "status",
-        "east m",
-        "north m",
-        "depth m",
-        "1 sigma cm",
-        "principal m^3",
-        "chi2/dof",
-        "reasons",
-    ):
-        table.add_column(name)
-    for r in results:
-        place = ["-", "-", "-", "-", "-"]
-        if r.targets:
-            t = r.targets[0]
-            sigma = float(t.covariance[[0, 1, 2], [0, 1, 2]].sum()) ** 0.5
-            principal = ", ".join(f"{p:.4g}" for p in t.principal_m3)
-            place = [
-                f"{t.position_m[0]:.3f}",
-                f"{t.position_m[1]:.3f}",
-                f"{t.depth_m:.3f}",
-                f"{sigma * 100:.2f}",
-                principal,
-            ]
-        fit = f"{r.chi2 / r.dof:.3f}" if r.chi2 is not None and r.dof else "-"
-        table.add_row(f"{r.batch_id}/{r.index}", r.status, *place, fit, ", ".join(r.reasons) or "-")
-    return table
-
-
-def _numbers(text: str | None, count: int) -> list[float] | None:
-    if text is None:
-        return None
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count:
-        raise TrackmeshError(f"{text!r} must be {count} numbers separated by commas.")
-    return numbers

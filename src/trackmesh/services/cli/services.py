@@ -4,20 +4,35 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
-from trackmesh.services.cli.options import Config, Connect, LogFormat, LogLevel, Realm, UnitId, told
+from trackmesh.services.cli.options import (
+    Config,
+    Connect,
+    LogFormat,
+    LogLevel,
+    Realm,
+    Scenario,
+    Seed,
+    UnitId,
+    say,
+    told,
+)
 from trackmesh.services.runtime import ServiceRuntime, ServiceSettings
 
-Scenario = Annotated[str, typer.Option("--scenario", help="A scenario's name, or a TOML file.")]
-Seed = Annotated[int, typer.Option("--seed", help="Everything random follows from it.")]
 StartNs = Annotated[
-    int | None, typer.Option("--start-ns", help="When the scenario began, UTC ns; default: now. One world, one start.")
+    int | None,
+    typer.Option(
+        "--start-ns",
+        min=0,
+        metavar="NS",
+        help="When the scenario began, UTC nanoseconds; default: now. Sensors of one world need the same.",
+    ),
 ]
 
-sim = typer.Typer(help="Simulated sensors, publishing in real time.", no_args_is_help=True)
+sim = typer.Typer(help="Simulated sensors: live, or as a recording.", no_args_is_help=True)
 
 
 def _given(**flags: object) -> dict[str, Any]:
@@ -26,12 +41,21 @@ def _given(**flags: object) -> dict[str, Any]:
 
 @told
 def router(
-    listen: Annotated[str | None, typer.Option("--listen", help="Endpoints: tcp/0.0.0.0:7447.")] = None,
-    config: Annotated[Path | None, typer.Option("--config", help="JSON5 file, as zenohd reads it.")] = None,
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            "--listen",
+            metavar="ENDPOINTS",
+            help="Where, separated by commas; default: tcp/127.0.0.1:7447; for other hosts tcp/0.0.0.0:7447.",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", metavar="FILE", help="JSON5 file, as zenohd reads it.")
+    ] = None,
     log_level: LogLevel = None,
     log_format: LogFormat = None,
 ) -> None:
-    """Run a Zenoh router in this process, where there is no zenohd."""
+    """Run a Zenoh router, where there is no zenohd."""
     from trackmesh.services.router import serve
 
     settings = ServiceSettings.load(None, _given(log_level=log_level, log_format=log_format))
@@ -44,9 +68,18 @@ def fusion(
     connect: Connect = None,
     realm: Realm = None,
     unit_id: UnitId = None,
-    unit_number: Annotated[int | None, typer.Option("--unit-number", help="Unique in the realm, 0 to 4095.")] = None,
-    clock: Annotated[str | None, typer.Option("--clock", help="wall, or data for replayed recordings.")] = None,
-    black_box: Annotated[Path | None, typer.Option("--black-box", help="Record the engine's inputs here.")] = None,
+    unit_number: Annotated[
+        int | None,
+        typer.Option("--unit-number", min=0, max=4095, metavar="N", help="Unique in the realm, 0 to 4095; default: 0."),
+    ] = None,
+    clock: Annotated[
+        Literal["wall", "data"] | None,
+        typer.Option("--clock", help="wall: plots are of now; data: they bring their own time (replays)."),
+    ] = None,
+    black_box: Annotated[
+        Path | None,
+        typer.Option("--black-box", metavar="FILE", help="Record the engine's inputs, for trackmesh track."),
+    ] = None,
     log_level: LogLevel = None,
     log_format: LogFormat = None,
 ) -> None:
@@ -67,11 +100,13 @@ def emi(
     connect: Connect = None,
     realm: Realm = None,
     unit_id: UnitId = None,
-    workers: Annotated[int | None, typer.Option("--workers", help="Requests answered at a time.")] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, metavar="N", help="Requests answered at a time.")
+    ] = None,
     log_level: LogLevel = None,
     log_format: LogFormat = None,
 ) -> None:
-    """Run an EMI service: batches of induction scans in, targets out."""
+    """Run an EMI service: induction scans in, targets out."""
     from trackmesh.services.emi.service import main
     from trackmesh.services.emi.settings import EmiSettings
 
@@ -99,7 +134,9 @@ def _run_simulator(kind: str, ident: str, flags: dict[str, Any], config: Path | 
 @told
 def sim_radar(
     scenario: Scenario = "two-radars",
-    radar: Annotated[str | None, typer.Option("--radar", help="Which radar; default: the first.")] = None,
+    radar: Annotated[
+        str | None, typer.Option("--radar", metavar="NAME", help="Which radar; default: the first.")
+    ] = None,
     seed: Seed = 1,
     start_ns: StartNs = None,
     config: Config = None,
@@ -108,13 +145,13 @@ def sim_radar(
     log_level: LogLevel = None,
     log_format: LogFormat = None,
 ) -> None:
-    """Be one rotating radar: publish its plots sector by sector as the beam turns."""
+    """Be one rotating radar. Its plots are published sector by sector as the beam turns."""
     from trackmesh.sim.live import run_radar
     from trackmesh.sim.scenario import load_scenario
 
     world = load_scenario(scenario)
     radar_id = world.radar(radar).id if radar else world.radars[0].id
-    begin_ns = start_ns or time.time_ns()
+    begin_ns = time.time_ns() if start_ns is None else start_ns
 
     def work(runtime: ServiceRuntime) -> None:
         run_radar(
@@ -137,11 +174,11 @@ def sim_truth(
     log_level: LogLevel = None,
     log_format: LogFormat = None,
 ) -> None:
-    """Publish where the simulated targets really are, for scoring."""
+    """Publish where the targets really are. For scoring."""
     from trackmesh.sim.live import run_truth
     from trackmesh.sim.scenario import load_scenario
 
-    world, begin_ns = load_scenario(scenario), start_ns or time.time_ns()
+    world, begin_ns = load_scenario(scenario), time.time_ns() if start_ns is None else start_ns
 
     def work(runtime: ServiceRuntime) -> None:
         run_truth(runtime.bus, world, seed, begin_ns, runtime.stopping, keys=runtime.keys)
@@ -153,34 +190,35 @@ def sim_truth(
 @sim.command("record")
 @told
 def sim_record(
-    plots: Annotated[Path, typer.Argument(help="PLOTS.jsonl to write.")],
-    truth: Annotated[Path | None, typer.Argument(help="TRUTH.jsonl to write.")] = None,
+    plots: Annotated[Path, typer.Argument(metavar="PLOTS.jsonl", help="File to write.")],
+    truth: Annotated[Path | None, typer.Argument(metavar="TRUTH.jsonl", help="File to write.")] = None,
     scenario: Scenario = "two-radars",
     seed: Seed = 1,
-    seconds: Annotated[float | None, typer.Option("--seconds", help="How much of the scenario.")] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option("--seconds", min=0.0, metavar="S", help="How much of the scenario; default: all of it."),
+    ] = None,
 ) -> None:
-    """Write what the sensors of a scenario would send to a file, faster than it happens."""
-    from trackmesh.services.cli.options import err
+    """Record what the sensors would send. Faster than it happens; the same seed gives the same bytes."""
     from trackmesh.services.cli.progress import progress_bar
     from trackmesh.sim.recording import write_recording
     from trackmesh.sim.scenario import load_scenario
 
     world = load_scenario(scenario)
-    with progress_bar("recording", seconds or world.duration_s) as advance:
+    with progress_bar("recording", world.duration_s if seconds is None else seconds) as advance:
         count = write_recording(world, seed, plots, truth, duration_s=seconds, progress=advance)
-    err.print(f"{count} plots of {world.name}, seed {seed}, in {plots}", highlight=False)
+    say(f"{count} plots of {world.name}, seed {seed}, in {plots}")
 
 
 @sim.command("emi")
 @told
 def sim_emi(
-    scans: Annotated[Path, typer.Argument(help="SCANS.jsonl to write.")],
+    scans: Annotated[Path, typer.Argument(metavar="SCANS.jsonl", help="File to write.")],
     scenario: Scenario = "two-radars",
     seed: Seed = 1,
 ) -> None:
-    """Write a batch of simulated induction scans of the targets buried in a scenario."""
+    """Write simulated induction scans. Of the targets that are buried in a scenario."""
     from trackmesh.protocol.files import RecordWriter
-    from trackmesh.services.cli.options import err
     from trackmesh.sim.emi import scenario_scans
     from trackmesh.sim.scenario import ScenarioError, load_scenario
 
@@ -190,4 +228,4 @@ def sim_emi(
     simulated = scenario_scans(world.emi, seed)
     with RecordWriter(scans) as file:
         file.write(simulated.batch)
-    err.print(f"{len(simulated.batch.field)} scans in {scans}", highlight=False)
+    say(f"{len(simulated.batch.field)} scans in {scans}")

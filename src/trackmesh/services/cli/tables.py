@@ -1,4 +1,4 @@
-"""Tables for people: tracks, sensors, services."""
+"""Tables for people: tracks, sensors, services, results of inversions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 
 from rich.table import Table
 
-from trackmesh.protocol.messages import SensorInfo, ServiceStatus, TrackFrame
+from trackmesh.protocol.messages import EmiResult, SensorInfo, ServiceStatus, TrackFrame
 
 STATUS_NAMES = ("tentative", "confirmed", "coasting", "ended")
 
@@ -114,6 +114,39 @@ def status_table(statuses: Iterable[ServiceStatus]) -> Table:
             life = "alive" if sensor.alive else "gone"
             counted = f"{sensor.plots} plots, {sensor.batches} batches, {sensor.gaps} missing, {sensor.refused} refused"
             table.add_row(f"  {sensor.sensor_id}", "", life, "", "", counted, "", "", "")
+    return table
+
+
+def result_table(results: list[EmiResult]) -> Table:
+    """One row a scan."""
+    table = Table(title=f"{len(results)} scans", title_justify="left")
+    for name in (
+        "scan",
+        "status",
+        "east m",
+        "north m",
+        "depth m",
+        "1 sigma cm",
+        "principal m^3",
+        "chi2/dof",
+        "reasons",
+    ):
+        table.add_column(name)
+    for r in results:
+        place = ["-", "-", "-", "-", "-"]
+        if r.targets:
+            t = r.targets[0]
+            sigma = float(t.covariance[[0, 1, 2], [0, 1, 2]].sum()) ** 0.5
+            principal = ", ".join(f"{p:.4g}" for p in t.principal_m3)
+            place = [
+                f"{t.position_m[0]:.3f}",
+                f"{t.position_m[1]:.3f}",
+                f"{t.depth_m:.3f}",
+                f"{sigma * 100:.2f}",
+                principal,
+            ]
+        fit = f"{r.chi2 / r.dof:.3f}" if r.chi2 is not None and r.dof else "-"
+        table.add_row(f"{r.batch_id}/{r.index}", r.status, *place, fit, ", ".join(r.reasons) or "-")
     return table
 
 

@@ -12,16 +12,23 @@ import numpy as np
 
 from trackmesh.services.emi import diagnosis as dg
 from trackmesh.services.emi.design import Sensor
+from trackmesh.services.emi.fit import Data, Enough, Fit, fit_target
 from trackmesh.services.emi.kernels import BoolArray, FloatArray
 from trackmesh.services.emi.results import Scan, ScanResult, Setting, Status, degrees_of_freedom, verdicts
-from trackmesh.services.emi.varpro import Bounds, Fit, fit_target
+from trackmesh.services.emi.varpro import Bounds
 
 CHUNK_SAMPLES = 10_000
 """Samples diagnosed together: many enough that small scans share the overhead, few enough to stream."""
 WINDOW_IN_DEPTHS = 2.0
 MAX_MASKED_SHARE = 0.5
-GOOD_CHI2 = 1.3
-"""Reduced chi2 with which a fit needs no other start, where the noise is known."""
+GOOD_SIGMAS = 5.0
+"""By how many standard deviations chi2 may exceed its mean in a fit that needs no other start (noise known)."""
+GOOD_GAIN = 4.0
+"""Likelihood ratio, in thresholds, that such a fit must have."""
+ROUNDING = 1e-14
+"""Part of a constant field that is left when the constant is taken off."""
+HOPELESS_GAIN = 0.5
+"""Likelihood ratio, in thresholds, below which a fit is not refined, since it will be no target."""
 GOOD_SHARE = 0.1
 """Share of the field's power left over with which a fit needs no other start."""
 
@@ -123,8 +130,12 @@ def invert(
     defect = dg.geometry_defect(sensor.place_m)
     chunk = max(1, CHUNK_SAMPLES // len(sensor.place_m))
     for first in range(0, len(field_t), chunk):
-        scans = [_prepare(i, field_t[i], sigma_t) for i in range(first, min(first + chunk, len(field_t)))]
-        yield from _invert_chunk(scans, sensor, setting, defect, options.robust)
+        indices = range(first, min(first + chunk, len(field_t)))
+        # Absurd numbers overflow; what comes of it is found by looking at the results.
+        with np.errstate(all="ignore"):
+            scans = [_prepare(i, field_t[i], sigma_t, options.background != "none") for i in indices]
+            results = _invert_chunk(scans, sensor, setting, defect, options.robust)
+        yield from results
 
 
 def _setting(coils: Coils, sensor: Sensor, sigma_known: bool, options: Options) -> Setting:
@@ -142,22 +153,26 @@ def _setting(coils: Coils, sensor: Sensor, sigma_known: bool, options: Options) 
 
 def _invert_chunk(
     scans: list[Scan], sensor: Sensor, setting: Setting, defect: str | None, robust: bool
-) -> Iterator[ScanResult]:
+) -> list[ScanResult]:
     results = {scan.scan_index: _without_fit(scan, sensor, setting, defect) for scan in scans}
     fitted = [(s, _fit(s, sensor, setting, robust)) for s in scans if results[s.scan_index] is None]
     results |= {s.scan_index: _counted(s, "invalid", "overflow") for s, _ in fitted}
     sound = [(scan, fit) for scan, fit in fitted if _is_finite(fit)]
     if sound:
         results |= {result.scan_index: result for result in verdicts(sound, setting)}
-    for result in results.values():
-        assert result is not None
-        yield result
+    return [result for result in results.values() if result is not None]
 
 
-def _prepare(index: int, field_t: FloatArray, sigma_t: FloatArray | float | None) -> Scan:
+def _prepare(index: int, field_t: FloatArray, sigma_t: FloatArray | float | None, centred: bool) -> Scan:
     sample_there: BoolArray = np.all(np.isfinite(field_t), axis=(0, 2))
     there = np.broadcast_to(sample_there[None, :, None], field_t.shape)
     y = np.where(there, field_t, 0.0)
+    if centred and sample_there.any():
+        # The background takes any constant; a large one must not cost digits.
+        level = float(np.abs(y).max())
+        y = np.where(there, y - y[:, sample_there].mean(1, keepdims=True), 0.0)
+        if float(np.abs(y).max()) <= ROUNDING * level:
+            y = np.zeros_like(y)
     if sigma_t is None:
         # Any scale will do; one near to the data keeps the numbers in range.
         sigma_t = float(np.abs(y).max(initial=0.0)) or 1.0
@@ -169,13 +184,13 @@ def _without_fit(scan: Scan, sensor: Sensor, setting: Setting, defect: str | Non
     """The answer for a scan that cannot be fitted, or None."""
     if scan.n_masked > MAX_MASKED_SHARE * scan.y.shape[1]:
         return _counted(scan, "invalid", "not_finite")
-    if not scan.y.any():
-        return _counted(scan, "no_target", "zero_field")
     if scan.n_masked:
         defect = dg.geometry_defect(sensor.place_m[scan.w[0, :, 0] > 0.0])
     if defect is None and degrees_of_freedom(scan, setting.n_background) <= 0:
         defect = "too_few_samples"
-    return None if defect is None else _counted(scan, "underdetermined", defect)
+    if defect is not None:
+        return _counted(scan, "underdetermined", defect)
+    return None if scan.y.any() else _counted(scan, "no_target", "zero_field")
 
 
 def _counted(scan: Scan, status: Status, reason: str) -> ScanResult:
@@ -189,5 +204,8 @@ def _is_finite(fit: Fit) -> bool:
 
 
 def _fit(scan: Scan, sensor: Sensor, setting: Setting, robust: bool) -> Fit:
-    good_rss = GOOD_CHI2 * float((scan.w > 0.0).sum()) if setting.sigma_known else 0.0
-    return fit_target(sensor, scan.y, scan.w, setting.bounds, robust, WINDOW_IN_DEPTHS, good_rss, GOOD_SHARE)
+    n = float((scan.w > 0.0).sum())
+    good_rss = n + GOOD_SIGMAS * float(np.sqrt(2.0 * n)) if setting.sigma_known else 0.0
+    good_gain = GOOD_GAIN * setting.lr_threshold if setting.sigma_known else 0.0
+    enough = Enough(good_rss, GOOD_SHARE, good_gain, HOPELESS_GAIN * setting.lr_threshold)
+    return fit_target(Data(sensor, scan.y, scan.w, setting.bounds, WINDOW_IN_DEPTHS), robust, enough)

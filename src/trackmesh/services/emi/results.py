@@ -9,13 +9,18 @@ import numpy as np
 
 from trackmesh.services.emi import diagnosis as dg
 from trackmesh.services.emi.design import N_TENSOR
+from trackmesh.services.emi.fit import Fit
 from trackmesh.services.emi.kernels import BoolArray, FloatArray, IntArray
-from trackmesh.services.emi.varpro import Bounds, Fit
+from trackmesh.services.emi.varpro import Bounds
 
+LEAST_NOISE = 1e-6
+"""Of the largest number in the scan: estimated noise is not below it, since rounding would pass for signal."""
 MISMATCH_P = 1e-6
 """p value of chi2 below which one dipole does not explain the scan."""
 POOR_DEPTH = 0.2
 """Standard deviation of the depth, by the depth, above which the answer is poor."""
+LINEAR_DEPTH = 0.015
+"""The same ratio above which the linearised covariance is too small: its 95 % ellipsoid misses the truth too often."""
 EDGE_IN_DEPTHS = 0.5
 """How far outside the scan, in depths, a target is seen only from one side."""
 DIPOLE_RADII = 6.0
@@ -138,7 +143,7 @@ def _stack(scans: Sequence[Scan], fits: Sequence[Fit], setting: Setting) -> _Sta
     variance = np.ones(len(fits))
     if not setting.sigma_known:
         variance = dg.noise_variance(chi2, np.array([f.scale for f in fits]), numbers, dof)
-        variance = np.maximum(variance, np.finfo(float).tiny)
+        variance = np.maximum(variance, LEAST_NOISE**2)
     p_value = dg.chi2_p_value(chi2, dof)
     mismatch = setting.sigma_known & (p_value < MISMATCH_P)
     inflation = variance * np.where(mismatch, np.maximum(chi2 / np.maximum(dof, 1), 1.0), 1.0)
@@ -170,7 +175,7 @@ def _verdict(scan: Scan, fit: Fit, stack: _Stack, i: int, setting: Setting) -> S
         tuple(reasons),
         _target(fit, stack, i, setting) if there else None,
         chi2=float(stack.chi2[i]),
-        dof=int(stack.dof[i]),
+        dof=max(int(stack.dof[i]), 0),
         p_value=float(stack.p_value[i]) if setting.sigma_known else None,
         likelihood_ratio=float(stack.lr[i]),
         sigma_t=_sigma(scan, float(stack.variance[i])),
@@ -188,12 +193,14 @@ def _judge(fit: Fit, stack: _Stack, i: int, setting: Setting) -> tuple[Status, l
     if not stack.determined[i]:
         return "underdetermined", ["information"]
     position, depth = fit.r_m, setting.bounds.surface_m - fit.r_m[2]
+    depth_sd = float(np.sqrt(stack.covariance[i, 2, 2]))
     found: list[tuple[bool, Status, str]] = [
         (not dg.inside(position, setting.bounds.lower_m, setting.bounds.upper_m), "edge", "at_search_bound"),
         (not _seen_around(position, depth, setting), "edge", "outside_scan"),
-        (float(np.sqrt(stack.covariance[i, 2, 2])) > POOR_DEPTH * depth, "low_snr", "depth_uncertain"),
+        (depth_sd > POOR_DEPTH * depth, "low_snr", "depth_uncertain"),
         (setting.sigma_known and stack.p_value[i] < MISMATCH_P, "multiple_or_mismatch", "misfit"),
         (depth < DIPOLE_RADII * setting.dipole_radius_m, "ok", "dipole_transmitter_near"),
+        (depth_sd > LINEAR_DEPTH * depth, "ok", "covariance_optimistic"),
         (not fit.converged, "ok", "not_converged"),
     ]
     true = [(status, reason) for holds, status, reason in found if holds]

@@ -19,6 +19,7 @@ from trackmesh.services.estimation.pairs import (
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 NUMBER_MASK = 2**31 - 1
 """Tracks are told apart by the low bits of their uid: no two that live together share them."""
@@ -65,7 +66,7 @@ class SequentialTest:
 
     def cycle(self, a: LocalTracks, b: LocalTracks, t_s: float) -> DeclaredPairs:
         """Add the evidence of this moment and declare pairs, one to one."""
-        key, ia, ib = self._candidates(a, b)
+        key, ia, ib, near = self._candidates(a, b)
         old, known = self._recall(key)
         distance, logdet = state_distances(a.x, a.P, b.x, b.P, ia, ib)
         density = local_density(a.x, b.x, self.rules.radius_m)[ia]
@@ -76,11 +77,13 @@ class SequentialTest:
         chosen = assignment.assign(ia[usable], ib[usable], score[usable], len(a.number), len(b.number))
         best = chosen[ib] == ia
         declared = best & ~barred & (pairs.ratio > np.where(old.declared, 0.0, _CONFIRM))
-        self._pairs = pairs._replace(declared=declared)
+        # Pairs that are neither near nor likely are forgotten, so that crossings of long ago take no room.
+        keep = near | (pairs.ratio > 0.0)
+        self._pairs = _Pairs(**{name: v[keep] for name, v in pairs._replace(declared=declared)._asdict().items()})
         return DeclaredPairs(ia[declared], ib[declared], pairs.ratio[declared])
 
-    def _candidates(self, a: LocalTracks, b: LocalTracks) -> tuple[IntArray, IntArray, IntArray]:
-        """Pairs close in position, and pairs under test whose tracks both live."""
+    def _candidates(self, a: LocalTracks, b: LocalTracks) -> tuple[IntArray, IntArray, IntArray, BoolArray]:
+        """Pairs close in position, and pairs under test whose tracks both live; which of them are close."""
         near = np.empty(0, np.int64)
         if len(a.number) and len(b.number):
             R = np.stack([b.P[:, 0, 0], b.P[:, 0, 1], b.P[:, 1, 1]], axis=1)
@@ -91,7 +94,7 @@ class SequentialTest:
         key = np.union1d(near, self._pairs.key)
         ia, ib = index_of(a.number, key >> 31), index_of(b.number, key & NUMBER_MASK)
         alive = (ia >= 0) & (ib >= 0)
-        return key[alive], ia[alive], ib[alive]
+        return key[alive], ia[alive], ib[alive], np.isin(key[alive], near)
 
     def _recall(self, key: IntArray) -> tuple[_Pairs, npt.NDArray[np.bool_]]:
         """The stored sums of these keys (zeros for new pairs), and which were stored."""
@@ -117,7 +120,8 @@ class SequentialTest:
         fade, fit_fade = np.exp(-dt / rules.memory_s), np.exp(-dt / rules.fit_memory_s)
         ratio = np.maximum(fade * old.ratio + w * increment, rules.floor)
         against = np.maximum(0.0, old.against - w * (increment + 0.5))
-        ratio = np.where(against > rules.break_at, np.minimum(ratio, 0.0), ratio)
+        broken = against > rules.break_at
+        ratio, against = np.where(broken, np.minimum(ratio, 0.0), ratio), np.where(broken, 0.0, against)
         # An infinite distance bars for a while, but must not stay infinite.
         misfit = fit_fade * old.misfit + w * np.minimum(distance, 1e6)
         return _Pairs(key, ratio, fit_fade * old.weight + w, misfit, against, np.full(len(key), t_s), old.declared)

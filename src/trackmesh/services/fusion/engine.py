@@ -124,7 +124,9 @@ class FusionEngine:
     def tick(self, t_ns: int) -> TrackFrame | None:
         """Let time advance without data; a picture now and then."""
         self._advance(self._to_s(t_ns))
-        self._note_ended(self._system.judge(self._now_s)[1])
+        confirmed, ended = self._system.judge(self._now_s)
+        self._name(confirmed)
+        self._note_ended(ended)
         for local in self._locals:
             local.judge(self._now_s)
         self._cycle_if_due()
@@ -205,6 +207,8 @@ class FusionEngine:
             return
         self._cycle_s = self._now_s
         for sensor, local in enumerate(self._locals):
+            # The tracks of a sensor that fell silent end here: it steps no more.
+            local.judge(self._now_s)
             membership.renew(self._system, local, sensor)
         seen = [self._local_tracks(local) for local in self._locals]
         self._pairs_declared = 0
@@ -253,6 +257,8 @@ class FusionEngine:
         free = known.member[old] < 0
         known.member[old][free] = known.member[young][free]
         known.last_s[old] = max(known.last_s[old], known.last_s[young])
+        for local in self._locals:
+            local.life.link[local.life.link == known.uid[young]] = known.uid[old]
         self._note_ended([(young, int(known.uid[young]), int(known.link[young]))])
         self._system.drop(young)
         self.counters["merged"] += 1

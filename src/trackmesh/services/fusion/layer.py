@@ -166,7 +166,7 @@ class Layer:
         z, R, t_s = plots.z[taken], plots.R[taken], plots.t_s[taken]
         fed = tracks.feed(self.models, self.filters, rows, z, R, t_s, look.sensor)
         gain = self._gain(i, j, cost, chosen, look)
-        lives.hit(self.life, self.rules, rows, t_s, gain, look.sensor)
+        lives.hit(self.life, self.rules, rows[fed], t_s[fed], gain[fed], look.sensor)
         row[taken] = rows
         by_confirmed[taken] = confirmed[chosen[taken]]
         return int(len(fed) - fed.sum())

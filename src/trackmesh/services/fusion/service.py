@@ -22,7 +22,8 @@ from trackmesh.services.fusion.warm_up import warm_up
 from trackmesh.services.runtime import Health, ServiceRuntime
 
 KIND = "fusion"
-_FRAMES_KEPT = 16
+# After an outage the plots of all of it come at once, and so do the frames; not every client is back by then.
+_FRAMES_KEPT = 128
 _PLOTS_WAITING = 4096
 _BATCHES_HELD = 64
 _SENSORS_HELD = 256
