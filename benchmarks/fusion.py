@@ -127,8 +127,8 @@ def main() -> None:
             _stonesoup(seed)
     mean, spread = np.mean(scores, axis=0), np.std(scores, axis=0)
     print(
-        f"mean of {len(scores)}: GOSPA {mean[0]:.1f} m (sd {spread[0]:.1f}), RMSE {mean[1]:.2f} m (sd {spread[1]:.2f}), "
-        f"switches {mean[2]:.2f}, missed {mean[3]:.3f}, false {mean[4]:.3f}"
+        f"mean of {len(scores)}: GOSPA {mean[0]:.1f} m (sd {spread[0]:.1f}), "
+        f"RMSE {mean[1]:.2f} m (sd {spread[1]:.2f}), switches {mean[2]:.2f}, missed {mean[3]:.3f}, false {mean[4]:.3f}"
     )
 
 

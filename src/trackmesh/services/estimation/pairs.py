@@ -3,8 +3,8 @@
 Each cycle adds, to the log-likelihood ratio of a pair,
 l = ln t_4(d; 0, S, nu) - ln rho + ln(4 pi s_v^2): the Student-t density of the difference of states against that of an
 unrelated track (rho tracks a square metre, velocities spread by s_v per axis), weighted by min(1, dt/tau_c) since
-differences are correlated in time, and forgets with exp(-dt/tau_f). The sum of squared distances, which is the statistic
-of Long, Cai, Li and Qiu (2022), bars pairs whose fit is absolutely bad.
+differences are correlated in time, and forgets with exp(-dt/tau_f). The sum of squared distances, the statistic of
+Long, Cai, Li and Qiu (2022), bars pairs whose fit is absolutely bad.
 """
 
 from __future__ import annotations
