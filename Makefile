@@ -22,7 +22,7 @@ studies: $(VENV)/ready
 	@echo "No study yet: the tables of the papers come with the filters and estimators they are about."
 
 bench: $(VENV)/ready
-	$(BIN)/python benchmarks/run.py
+	$(BIN)/python -m benchmarks.run
 
 $(VENV)/ready: pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "trackmesh needs Python 3.11 or newer")'

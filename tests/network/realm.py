@@ -41,7 +41,7 @@ sigma_range_m = 30.0
 sigma_azimuth_deg = 0.05
 clutter_per_scan = 2.0
 max_range_m = 120e3
-sectors = {sectors}
+sectors = 8
 
 [[radars]]
 id = "east"
@@ -52,7 +52,7 @@ sigma_range_m = 30.0
 sigma_azimuth_deg = 0.05
 clutter_per_scan = 2.0
 max_range_m = 120e3
-sectors = {sectors}
+sectors = 8
 """
 
 
@@ -74,18 +74,24 @@ def confirmed(frame: TrackFrame) -> set[int]:
     return set(frame.track_id[frame.status == CONFIRMED].tolist())
 
 
+def write_scenario(folder: Path) -> Path:
+    """The scenario as a file."""
+    path = folder / "quick.toml"
+    path.write_text(_SCENARIO)
+    return path
+
+
 class Realm:
     """One key space at one router; what runs in it is kept by whoever starts it."""
 
     main: Process
     sensors: dict[str, Process]
 
-    def __init__(self, processes: Processes, router: RouterProcess, folder: Path, sectors: int = 8) -> None:
+    def __init__(self, processes: Processes, router: RouterProcess, folder: Path) -> None:
         self._processes = processes
         self._start_ns = time.time_ns()
         self.endpoint = router.endpoint
-        self.scenario = folder / "quick.toml"
-        self.scenario.write_text(_SCENARIO.format(sectors=sectors))
+        self.scenario = write_scenario(folder)
 
     def trackmesh(self, *arguments: str) -> Process:
         """Start a command that joins the network."""

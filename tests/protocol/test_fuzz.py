@@ -30,6 +30,7 @@ ODD: list[Any] = [
     "", "a", "north", "*", "\0", "é" * 70, b"", b"\0" * 8, b"\xff" * 24, [], [[]], [[], []], [None], [1], [1.5], ["a"],
     [[1.0, 2.0]], {}, {"a": 1}, {"dtype": "<f8", "shape": [0], "data": b""},
     {"dtype": "<i8", "shape": [1], "data": b"\0" * 8}, {"dtype": "<f8", "shape": [0, 2**30], "data": b""},
+    {"dtype": "<f8", "shape": [1, 1, 1, 3], "data": b"\0\0\0\0\0\0\xf0\x7f" * 3},
     msgpack.ExtType(1, b"x"), msgpack.Timestamp(1, 2),
 ]  # fmt: skip
 

@@ -7,6 +7,7 @@ holds ``tracks``; ``TRUTH.jsonl`` holds ``truth``; ``SCANS.jsonl`` holds ``emi_s
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -120,19 +121,28 @@ class RecordWriter:
     """Writes records to a file, a line each, flushed at every line so that a killed process loses none."""
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         try:
             self._file: TextIO = path.open("w", encoding="utf-8")
         except OSError as error:
             raise TrackmeshError(f"Cannot write {path}: {error.strerror}.") from None
 
     def write(self, record: Message) -> None:
-        """Append one record."""
-        self._file.write(to_line(record) + "\n")
-        self._file.flush()
+        """Append one record.
+
+        Raises:
+            TrackmeshError: it cannot be written (the disk is full).
+        """
+        try:
+            self._file.write(to_line(record) + "\n")
+            self._file.flush()
+        except OSError as error:
+            raise TrackmeshError(f"Cannot write {self._path}: {error.strerror}.") from None
 
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Close the file; what could not be written before is not tried again."""
+        with contextlib.suppress(OSError):
+            self._file.close()
 
     def __enter__(self) -> Self:
         return self

@@ -2,7 +2,7 @@
 
 What makes it robust is chosen by measurement: a receiving callback only appends to a buffer of ours, so that a slow
 reader never holds up another key of the session; samples are dropped rather than blocking a publisher; messages that
-must not be missed go through advanced publishers and subscribers, which fill gaps from a cache.
+must not be missed are kept by their publishers (``zenoh_history``).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from enum import IntEnum
 from pathlib import Path
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Generic, Self, TypeVar
 
 import zenoh
 from zenoh import ext, handlers
@@ -27,10 +27,10 @@ from trackmesh.protocol.errors import BusError
 from trackmesh.protocol.keys import parse_parameters
 from trackmesh.protocol.serving import Job, QueryPool
 from trackmesh.protocol.zenoh_config import client_config, endpoints_of
+from trackmesh.protocol.zenoh_history import Undeclarable, declare_publisher, declare_subscriber
 
 _log = logging.getLogger(__name__)
 
-HEARTBEAT_S = 0.2
 CLOSE_DEADLINE_S = 3.0
 RETRY_S = 0.2
 ALIVE_CAPACITY = 65_536
@@ -45,17 +45,13 @@ class _Rank(IntEnum):
     SUBSCRIPTION, SERVER, TOKEN, PUBLISHER = range(4)
 
 
-class _Undeclarable(Protocol):
-    def undeclare(self) -> None: ...
-
-
 class _Declaration:
     """Something declared in a session, taken back once; a session that is closed has done so already."""
 
     rank = _Rank.TOKEN
 
-    def __init__(self, declared: _Undeclarable) -> None:
-        self._declared: _Undeclarable | None = declared
+    def __init__(self, declared: Undeclarable) -> None:
+        self._declared: Undeclarable | None = declared
         self._lock = threading.Lock()
         self.forget: Callable[[], None] = lambda: None
 
@@ -76,7 +72,7 @@ class _Declaration:
 class _Subscription(_Declaration, Generic[T]):
     rank = _Rank.SUBSCRIPTION
 
-    def __init__(self, subscriber: _Undeclarable, buffer: Buffer[T]) -> None:
+    def __init__(self, subscriber: Undeclarable, buffer: Buffer[T]) -> None:
         super().__init__(subscriber)
         self.buffer = buffer
         buffer.on_close(self.close)
@@ -220,14 +216,14 @@ class ZenohBus:
 
     def publisher(self, key: str, *, history: int = 0) -> _ZenohPublisher:
         """See ``Bus.publisher``."""
-        return self._declare(lambda session: _ZenohPublisher(_publisher(session, key, history)))
+        return self._declare(lambda session: _ZenohPublisher(declare_publisher(session, key, history)))
 
     def subscribe(self, expression: str, *, history: bool = False, capacity: int = 256) -> Buffer[Sample]:
         """See ``Bus.subscribe``."""
         buffer: Buffer[Sample] = Buffer(capacity)
         callback = _offer_to(buffer)
         return self._declare(
-            lambda session: _Subscription(_subscriber(session, expression, history, callback), buffer)
+            lambda session: _Subscription(declare_subscriber(session, expression, history, callback), buffer)
         ).buffer
 
     def query(
@@ -325,36 +321,6 @@ class ZenohBus:
         for one in declared:
             one.close()
         self._session.close()  # type: ignore[no-untyped-call]
-
-
-def _publisher(session: zenoh.Session, key: str, history: int) -> zenoh.Publisher | ext.AdvancedPublisher:
-    drop, high = zenoh.CongestionControl.DROP, zenoh.Priority.DATA_HIGH
-    if not history:
-        return session.declare_publisher(key, congestion_control=drop, priority=high, express=True)
-    return ext.declare_advanced_publisher(
-        session,
-        key,
-        congestion_control=drop,
-        priority=high,
-        express=True,
-        cache=ext.CacheConfig(max_samples=history),
-        sample_miss_detection=ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
-        publisher_detection=True,
-    )
-
-
-def _subscriber(
-    session: zenoh.Session, expression: str, history: bool, callback: Callable[[zenoh.Sample], None]
-) -> _Undeclarable:
-    if not history:
-        return session.declare_subscriber(expression, callback)
-    return ext.declare_advanced_subscriber(
-        session,
-        expression,
-        callback,
-        history=ext.HistoryConfig(detect_late_publishers=True),
-        recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-    )
 
 
 def _offer_to(buffer: Buffer[Sample]) -> Callable[[zenoh.Sample], None]:

@@ -102,7 +102,7 @@ def test_geodetic_plots(height_m: float | None) -> None:
     z, R = sensor.plane(batch("ais", 0.0, np.array([values]), columns))
     want = pymap3d.geodetic2enu(*place, height_m or 0.0, *ORIGIN_DEG)[:2]
     np.testing.assert_allclose(z[0], want, atol=1e-6)
-    assert R.tolist() == [[225.0, 0.0, 625.0]]
+    assert R.tolist() == [[625.0, 0.0, 225.0]]  # longitude is east
 
 
 def test_variances_of_the_batch_come_before_sigma() -> None:

@@ -66,10 +66,7 @@ def demo(
         return
     report = demo_report(state, world, seed)
     out.print(report.table)
-    draw_tracks(
-        records_of(folder / TRACKS, TrackFrame), records_of(folder / TRUTH, TruthFrame), out=folder / "tracks.png"
-    )
-    say(f"picture, recordings and logs in {folder}")
+    _draw(folder, stop.is_set())
     if bad:
         fail(f"These processes did not end well: {', '.join(bad)}.")
     if stop.is_set():
@@ -78,6 +75,18 @@ def demo(
         fail(report.error)
     if seconds >= _LONG_ENOUGH_S and not report.share >= _ENDED_WELL:
         fail(f"Only {report.share:.0%} of the targets in coverage have exactly one track.")
+
+
+def _draw(folder: Path, interrupted: bool) -> None:
+    frames, truth = records_of(folder / TRACKS, TrackFrame), records_of(folder / TRUTH, TruthFrame)
+    try:
+        draw_tracks(frames, truth, out=folder / "tracks.png")
+    except TrackmeshError as error:
+        # Who leaves before the first track has no picture, and needs none.
+        if not interrupted:
+            raise
+        say(str(error))
+    say(f"picture, recordings and logs in {folder}")
 
 
 class Setting(NamedTuple):

@@ -34,13 +34,9 @@ class BlackBox:
         if origin is not None:
             self._writer.write(origin)
 
-    def take(self, record: SensorInfo | PlotBatch) -> None:
+    def take(self, record: SensorInfo | PlotBatch | Tick) -> None:
         """Record an input."""
         self._writer.write(record)
-
-    def tick(self, t_ns: int) -> None:
-        """Record a tick."""
-        self._writer.write(Tick(t_ns=t_ns))
 
     def close(self) -> None:
         """Close the file."""

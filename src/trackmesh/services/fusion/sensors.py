@@ -79,13 +79,15 @@ class Sensor:
     def _variances(self, batch: PlotBatch) -> FloatArray:
         if batch.variances is not None:
             return batch.variances
-        for name in batch.columns[:2]:
+        # Variances go east, north; of geodetic columns the second, longitude, is east.
+        names = batch.columns[:2] if batch.columns[0] != "latitude_deg" else ["longitude_deg", "latitude_deg"]
+        for name in names:
             if name not in self.info.sigma:
                 raise RefusedMessage(
                     "no_variance", f"Sensor {self.info.sensor_id} gives neither variances nor sigma of {name}."
                 )
-        sigma = np.array([self.info.sigma.get(name, np.inf) for name in batch.columns])
-        return np.broadcast_to(sigma * sigma, batch.values.shape)
+        sigma = np.array([self.info.sigma[name] for name in names])
+        return np.broadcast_to(sigma * sigma, (len(batch.values), 2))
 
     def _polar(self, batch: PlotBatch, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
         if self.info.site is None and self.info.site_enu_m is None:

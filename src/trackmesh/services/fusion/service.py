@@ -10,7 +10,8 @@ from collections.abc import Iterator
 from trackmesh.protocol.buffer import Buffer
 from trackmesh.protocol.bus import Query, Sample
 from trackmesh.protocol.codec import decode, encode, encoding, open_envelope
-from trackmesh.protocol.errors import QueryFailed, RefusedMessage
+from trackmesh.protocol.errors import QueryFailed, RefusedMessage, TrackmeshError
+from trackmesh.protocol.files import Tick
 from trackmesh.protocol.keys import kind_and_id, last_chunk
 from trackmesh.protocol.messages import PlotBatch, SensorHealth, SensorInfo, TrackFrame, TrackQuery
 from trackmesh.protocol.serving import answers
@@ -126,8 +127,7 @@ class FusionService:
     def _take_info(self, info: SensorInfo) -> None:
         known = self.engine.sensors.get(info.sensor_id)
         if known is None or known.info != info:
-            if self._black_box:
-                self._black_box.take(info)
+            self._record(info)
             with self._lock:
                 self.engine.sensor(info)
             self.runtime.log.info("sensor %s: %s, every %g s", info.sensor_id, info.kind, info.period_s)
@@ -157,8 +157,7 @@ class FusionService:
             raise RefusedMessage("too_many_sensors", f"Too many sensors are unknown already, {sensor_id} is left out.")
 
     def _take_batch(self, batch: PlotBatch) -> None:
-        if self._black_box:
-            self._black_box.take(batch)
+        self._record(batch)
         try:
             with self._lock:
                 frame = self.engine.plots(batch)
@@ -177,8 +176,7 @@ class FusionService:
             return
         self._tick_due_s = time.monotonic() + self.settings.tick_s
         t_ns = time.time_ns()
-        if self._black_box:
-            self._black_box.tick(t_ns)
+        self._record(Tick(t_ns=t_ns))
         with self._lock:
             frame = self.engine.tick(t_ns)
         self._publish(frame)
@@ -187,6 +185,17 @@ class FusionService:
         if frame is not None:
             self._frames.put(encode(frame), encoding(frame))
             self.runtime.counters.count("frames")
+
+    def _record(self, record: SensorInfo | PlotBatch | Tick) -> None:
+        if self._black_box is None:
+            return
+        try:
+            self._black_box.take(record)
+        except TrackmeshError as error:
+            # The picture matters more than its record.
+            self.runtime.log.error("the black box ends here: %s", error)
+            self.runtime.counters.count("black_box_failures")
+            self._black_box = None
 
     # --- sensors not yet known ---
 

@@ -1,0 +1,176 @@
+"""Publishers that keep what they sent, subscribers that miss nothing of it: Zenoh's advanced pair, and what it lacks.
+
+The library fills gaps between samples of a publisher that it knows. Two of its means do not work with keys that have a
+verbatim chunk (``@v1``), and say nothing of it: it does not notice a publisher that comes later, and does not understand
+heartbeats. So a subscriber here asks a publisher's cache itself when it first hears of it, by its token or by a sample,
+holds back what comes meanwhile, and delivers all in order; and a lost last sample is found by asking periodically.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import timedelta
+from typing import Protocol
+
+import zenoh
+from zenoh import ext, handlers
+
+RECOVERY_S = 0.5
+FETCH_TIMEOUT_S = 2.0
+RETRIES_S = (0.05, 0.15)
+"""Just after a link is back, a question finds nobody for some ten milliseconds."""
+
+HELD_MOST = 10_000
+SOURCES_MOST = 10_000
+
+Deliver = Callable[[zenoh.Sample], None]
+_Source = tuple[str, int]
+
+
+class Undeclarable(Protocol):
+    """A declaration of the library."""
+
+    def undeclare(self) -> None:
+        """Take it back."""
+
+
+def declare_publisher(session: zenoh.Session, key: str, history: int) -> zenoh.Publisher | ext.AdvancedPublisher:
+    """A publisher that never blocks, and keeps its last ``history`` samples."""
+    drop, high = zenoh.CongestionControl.DROP, zenoh.Priority.DATA_HIGH
+    if not history:
+        return session.declare_publisher(key, congestion_control=drop, priority=high, express=True)
+    return ext.declare_advanced_publisher(
+        session,
+        key,
+        congestion_control=drop,
+        priority=high,
+        express=True,
+        cache=ext.CacheConfig(max_samples=history),
+        # For the sequence numbers; heartbeats would go unheard.
+        sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+        publisher_detection=True,
+    )
+
+
+def declare_subscriber(session: zenoh.Session, expression: str, history: bool, deliver: Deliver) -> Undeclarable:
+    """A subscriber; with ``history`` it is given what publishers keep as well, each publisher's samples in order."""
+    if history:
+        return _HistorySubscriber(session, expression, deliver)
+    return session.declare_subscriber(expression, deliver)
+
+
+class _HistorySubscriber:
+    def __init__(self, session: zenoh.Session, expression: str, deliver: Deliver) -> None:
+        merge = _Merge(session, deliver)
+        # The stubs want seconds, the library a timedelta.
+        every: float = timedelta(seconds=RECOVERY_S)  # type: ignore[assignment]
+        self._subscriber = ext.declare_advanced_subscriber(
+            session, expression, merge.on_sample, recovery=ext.RecoveryConfig(periodic_queries=every, heartbeat=None)
+        )
+        self._tokens = self._subscriber.detect_publishers(merge.on_token, history=True)
+
+    def undeclare(self) -> None:
+        self._tokens.undeclare()  # type: ignore[no-untyped-call]
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+@dataclass
+class _Stream:
+    """The samples of one publisher: ``held`` is not None while its cache is being asked."""
+
+    held: list[zenoh.Sample] | None = field(default_factory=list)
+    last: int | None = None
+    found: bool = False
+    attempts: int = 0
+
+
+class _Merge:
+    """Puts what a cache answers before what comes live."""
+
+    def __init__(self, session: zenoh.Session, deliver: Deliver) -> None:
+        self._session = session
+        self._deliver = deliver
+        self._lock = threading.Lock()
+        self._streams: OrderedDict[_Source, _Stream] = OrderedDict()
+
+    def on_token(self, token: zenoh.Sample) -> None:
+        """A publisher is there: ``{key}/@adv/pub/{zid}/{eid}/_``; this is also where its cache answers."""
+        cache = str(token.key_expr)
+        zid, eid = cache.split("/")[-3:-1]
+        if token.kind == zenoh.SampleKind.PUT and eid.isdigit():
+            self._stream((zid, int(eid)), cache)
+
+    def on_sample(self, sample: zenoh.Sample) -> None:
+        """A sample came live, or was recovered by the library."""
+        info = sample.source_info
+        if info is None:
+            self._deliver(sample)
+            return
+        source = (str(info.source_id.zid), info.source_id.eid)
+        stream = self._stream(source, f"{sample.key_expr}/@adv/pub/{source[0]}/{source[1]}/_")
+        with self._lock:
+            if stream.held is None:
+                self._deliver_new(stream, sample)
+            elif len(stream.held) < HELD_MOST:
+                stream.held.append(sample)
+
+    def _stream(self, source: _Source, cache: str) -> _Stream:
+        with self._lock:
+            stream = self._streams.get(source)
+            if stream is not None:
+                return stream
+            stream = self._streams[source] = _Stream()
+            if len(self._streams) > SOURCES_MOST:
+                self._streams.popitem(last=False)
+        self._fetch(stream, cache)
+        return stream
+
+    def _fetch(self, stream: _Stream, cache: str) -> None:
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None and stream.held is not None:
+                stream.found = True
+                stream.held.append(reply.ok)
+
+        try:
+            self._session.get(
+                cache,
+                handlers.Callback(on_reply, lambda: self._fetched(stream, cache)),
+                consolidation=zenoh.ConsolidationMode.NONE,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+                timeout=FETCH_TIMEOUT_S,
+            )
+        except zenoh.ZError:
+            self._release(stream)
+
+    def _fetched(self, stream: _Stream, cache: str) -> None:
+        if stream.found or stream.attempts == len(RETRIES_S):
+            self._release(stream)
+            return
+        retry = threading.Timer(RETRIES_S[stream.attempts], self._fetch, (stream, cache))
+        stream.attempts += 1
+        retry.daemon = True
+        retry.start()
+
+    def _release(self, stream: _Stream) -> None:
+        with self._lock:
+            held, stream.held = stream.held or [], None
+            for sample in sorted(held, key=lambda sample: _after(_number(sample), _number(held[0]))):
+                self._deliver_new(stream, sample)
+
+    def _deliver_new(self, stream: _Stream, sample: zenoh.Sample) -> None:
+        number = _number(sample)
+        if stream.last is None or _after(number, stream.last) > 0:
+            stream.last = number
+            self._deliver(sample)
+
+
+def _number(sample: zenoh.Sample) -> int:
+    return sample.source_info.source_sn if sample.source_info is not None else 0
+
+
+def _after(number: int, other: int) -> int:
+    """How far a number lies after another; they have 32 bits and go round."""
+    return (number - other + 2**31) % 2**32 - 2**31
