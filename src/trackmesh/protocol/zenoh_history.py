@@ -1,7 +1,7 @@
 """Publishers that keep what they sent, subscribers that miss nothing of it: Zenoh's advanced pair, and what it lacks.
 
 The library fills gaps between samples of a publisher that it knows. Two of its means do not work with keys that have a
-verbatim chunk (``@v1``), and say nothing of it: it does not notice a publisher that comes later, and does not understand
+verbatim chunk (``@v1``), and say nothing of it: it does not notice a publisher that comes later, nor understand
 heartbeats. So a subscriber here asks a publisher's cache itself when it first hears of it, by its token or by a sample,
 holds back what comes meanwhile, and delivers all in order; and a lost last sample is found by asking periodically.
 """
