@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -95,12 +96,15 @@ def score(
                 records_of(tracks, TrackFrame), records_of(truth, TruthFrame), c_m, warmup_s, advance
             )
         figures = summary.as_dict()
+    if not figures["frames"]:
+        raise TrackmeshError(f"No frame of {tracks} is to be scored: all lie outside the truth or within the warm-up.")
     if as_json:
-        print(json.dumps(figures))
+        # JSON knows no NaN.
+        print(json.dumps({name: value if math.isfinite(value) else None for name, value in figures.items()}))
         return
     table = Table("figure", "value", title=f"{tracks} against {truth}", title_justify="left")
     for name, value in figures.items():
-        table.add_row(name, f"{value:.4g}")
+        table.add_row(name, f"{value}" if isinstance(value, int) else f"{value:.4g}")
     out.print(table)
 
 
