@@ -19,7 +19,8 @@ check: $(VENV)/ready
 	$(BIN)/lint-imports --no-cache
 
 studies: $(VENV)/ready
-	@echo "No study yet: the tables of the papers come with the filters and estimators they are about."
+	mkdir -p out/studies
+	$(BIN)/trackmesh study alpha-beta --json out/studies/alpha-beta.json --plots out/studies
 
 bench: $(VENV)/ready
 	$(BIN)/python -m benchmarks.run

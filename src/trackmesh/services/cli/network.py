@@ -163,9 +163,10 @@ def play(
 
     At another speed than 1 the recorded times are kept, and fusion needs --clock data.
     """
-    stop = threading.Event()
+    # All of it first: what is wrong with the file is told before anything is published.
+    records, stop = list(read_records(plots)), threading.Event()
     with client(connect, realm, config) as ask, on_signal(lambda _: stop.set()):
-        sent = play_records(ask.bus, ask.keys, list(read_records(plots)), speed, keep_time or speed != 1.0, stop)
+        sent = play_records(ask.bus, ask.keys, records, speed, keep_time or speed != 1.0, stop)
     say(f"{sent} batches published")
 
 

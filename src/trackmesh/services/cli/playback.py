@@ -12,7 +12,13 @@ from trackmesh.protocol.keys import Keys
 from trackmesh.protocol.messages import Message, PlotBatch, SensorInfo
 from trackmesh.protocol.sensor import SensorPublisher
 
-_FLUSH_S = 0.5
+# Who subscribes first asks a new sensor for what it has kept, and holds back the rest for so long: plots sent meanwhile
+# would come one sensor after the other instead of in the order of the recording.
+_SETTLE_S = 1.0
+_FLUSH_S = 1.5
+_KEPT = 1024
+# Publishers drop what the network cannot take, so "as fast as possible" has a limit.
+_GAP_S = 0.002
 
 
 def play_records(
@@ -36,7 +42,7 @@ def play_records(
     sensors: dict[str, SensorPublisher] = {}
     sent = 0
     first_ns: int | None = None
-    started_ns = time.time_ns()
+    started_ns = 0
     for record in records:
         if stop.is_set():
             break
@@ -44,10 +50,13 @@ def play_records(
             if record.sensor_id in sensors:
                 sensors[record.sensor_id].announce(record)
             else:
-                sensors[record.sensor_id] = SensorPublisher(bus, keys.realm, record)
+                sensors[record.sensor_id] = SensorPublisher(bus, keys.realm, record, history=_KEPT)
         elif isinstance(record, PlotBatch):
             if record.sensor_id not in sensors:
                 raise TrackmeshError(f"Plots of {record.sensor_id} come before its description.")
+            if not started_ns:
+                stop.wait(_SETTLE_S)
+                started_ns = time.time_ns()
             if len(record.t_ns):
                 first_ns = int(record.t_ns.min()) if first_ns is None else first_ns
                 _wait(started_ns, int(record.t_ns.max()) - first_ns, speed, stop)
@@ -61,7 +70,9 @@ def play_records(
                 scan=record.scan,
             )
             sent += 1
-    # The network library sends in the background; what is last must get out too.
+            if not speed:
+                stop.wait(_GAP_S)
+    # The network library sends in the background; what is last, or was lost on the way, must get out too.
     stop.wait(_FLUSH_S)
     for publisher in sensors.values():
         publisher.close()
