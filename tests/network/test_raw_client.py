@@ -1,6 +1,6 @@
 """A client that was written from docs/protocol.md alone, against real processes: nothing here imports our code.
 
-It knows Zenoh, msgpack, JSON and the layout of arrays; it publishes plots, hears frames, asks for tracks, and has a scan
+It knows Zenoh, msgpack, JSON and the layout of arrays; it publishes plots, hears frames, asks for tracks, and has scans
 inverted.
 """
 
@@ -88,8 +88,10 @@ class RawClient:
                 yield msgpack.unpackb(data)
 
     def answers(self, selector: str, name: str, fields: Fields) -> list[Fields]:
-        """The payloads of a whole answer."""
+        """The payloads of a whole answer, which is of the schema that the page names for this question."""
         envelopes = list(self.ask(selector, name, fields))
+        schema = {"TrackQuery": "trackmesh.TrackFrame.v1", "EmiScanBatch": "trackmesh.EmiResult.v1"}[name]
+        assert {envelope["schema_name"] for envelope in envelopes[:-1]} == {schema}
         assert [envelope["kind"] for envelope in envelopes] == ["ok"] * (len(envelopes) - 1) + ["end"], envelopes
         assert envelopes[-1]["count"] == len(envelopes) - 1
         return [envelope["payload"] for envelope in envelopes[:-1]]
@@ -99,7 +101,7 @@ class RawClient:
         return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
     def close(self) -> None:
-        self._subscriber.undeclare()
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
         self.session.close()  # type: ignore[no-untyped-call]
 
     def _hear(self, sample: zenoh.Sample) -> None:
@@ -122,9 +124,8 @@ def polar(places: Numbers) -> tuple[Numbers, Numbers]:
 
 
 def service(processes: Processes, router: RouterProcess, kind: str) -> Process:
-    return processes.start(
-        "-m", "trackmesh.services.cli.main", kind, "--connect", router.endpoint, "--realm", "rawtest", "--unit-id", "one"
-    )  # fmt: skip
+    where = ["--connect", router.endpoint, "--realm", "rawtest", "--unit-id", "one"]
+    return processes.start("-m", "trackmesh.services.cli.main", kind, *where)
 
 
 @pytest.fixture
@@ -283,4 +284,4 @@ def test_the_example_of_the_page_runs(client: RawClient, processes: Processes, r
     wait_until(ran, "the plots of the example are heard")
     fields = msgpack.unpackb(heard.get().payload.to_bytes())
     assert numbers(fields["values"]).tolist() == [[10e3, 0.5], [12e3, 1.5]]
-    subscriber.undeclare()
+    subscriber.undeclare()  # type: ignore[no-untyped-call]
