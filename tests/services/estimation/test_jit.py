@@ -8,7 +8,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from tests.services.estimation.makers import DIRICHLET, fed_walk, plain_python
+from tests.services.estimation.makers import NAMED, fed_walk, plain_python
 
 from trackmesh.services.estimation import imm, jit
 
@@ -20,8 +20,9 @@ def test_kernels_are_compiled_here_and_plain_python_on_request() -> None:
 
 def test_compiled_and_plain_give_the_same_numbers() -> None:
     """To 1e-10 relative: compiled code may contract and reorder sums."""
-    want = plain_python("fed_walk(DIRICHLET).tolist()", "tests.services.estimation.makers")
-    np.testing.assert_allclose(fed_walk(DIRICHLET), want, rtol=1e-10, atol=1e-10)
+    plain = plain_python("{n: fed_walk(m).tolist() for n, m in NAMED.items()}", "tests.services.estimation.makers")
+    for name, models in NAMED.items():
+        np.testing.assert_allclose(fed_walk(models), plain[name], rtol=1e-10, atol=1e-10, err_msg=name)
 
 
 def copied(target: Path) -> ModuleType:

@@ -8,6 +8,8 @@ from tests.services.estimation.makers import (
     DIRICHLET,
     LAW,
     MODELS,
+    NAMED,
+    TVIMM,
     FloatArray,
     Plot,
     begin_row,
@@ -17,17 +19,17 @@ from tests.services.estimation.makers import (
     filtered,
     fresh_filters,
     head,
+    interacted,
     mixture_moments,
     packed,
     predicted,
     random_walk,
-    scratch,
     seeds,
 )
 
 from trackmesh.services.estimation import gating, tracks
-from trackmesh.services.estimation.imm import Models, interact
-from trackmesh.services.estimation.tracks import Filters, make_filters
+from trackmesh.services.estimation.bank import Models
+from trackmesh.services.estimation.tracks import Filters, join_rows, make_filters
 
 RING = 6
 ROW = np.array([0])
@@ -43,8 +45,8 @@ def fed(models: Models, plots: list[Plot], ring: int = RING) -> Filters:
 def meaning(f: Filters, row: int) -> list[FloatArray]:
     """All that a row holds; of the ring only the entries in use."""
     n = f.ring_n[row]
-    rings = {"ring_z", "ring_R", "ring_t_s", "ring_sensor"}
-    return [a[row][:n] if name in rings else a[row] for name, a in zip(Filters._fields, f, strict=True)]
+    rings = [a[row][:n] for a in (f.ring_z, f.ring_R, f.ring_t_s, f.ring_sensor)]
+    return [a[row] for a in (*f.head, *f.lag, f.ring_n, f.mean, f.spread)] + rings
 
 
 def same(one: Filters, other: Filters, row: int = 0) -> bool:
@@ -66,7 +68,7 @@ def late_order(rng: np.random.Generator, n: int, reach: int) -> list[int]:
 # --- late plots ---
 
 
-@pytest.mark.parametrize("models", [MODELS, DIRICHLET], ids=["imm", "dirichlet"])
+@pytest.mark.parametrize("models", NAMED.values(), ids=NAMED)
 @LAW
 @given(seed=seeds, n=st.integers(2, 25))
 def test_any_order_within_the_ring_is_the_order_of_time(models: Models, seed: int, n: int) -> None:
@@ -78,13 +80,14 @@ def test_any_order_within_the_ring_is_the_order_of_time(models: Models, seed: in
     assert same(shuffled, in_order)
 
 
+@pytest.mark.parametrize("models", [DIRICHLET, TVIMM], ids=["dirichlet", "tvimm"])
 @LAW
-@given(seeds)
-def test_the_head_is_what_the_filter_of_one_track_gives(seed: int) -> None:
+@given(seed=seeds)
+def test_the_head_is_what_the_filter_of_one_track_gives(models: Models, seed: int) -> None:
     plots = random_walk(np.random.default_rng(seed), 15)
-    f = fed(DIRICHLET, plots)
-    begun = head(fresh_filters(DIRICHLET, plots[0]))
-    for got, want in zip(head(f), filtered(DIRICHLET, begun, plots[1:], plots[0].t_s), strict=True):
+    f = fed(models, plots)
+    begun = head(fresh_filters(models, plots[0]))
+    for got, want in zip(head(f), filtered(models, begun, plots[1:]), strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-9)
 
 
@@ -92,18 +95,18 @@ def test_the_lagged_state_is_the_head_without_the_ring() -> None:
     plots = random_walk(np.random.default_rng(1), 20)
     f, short = fed(DIRICHLET, plots), fed(DIRICHLET, plots[:-RING])
     assert f.ring_n[0] == RING
-    assert f.lag_t_s[0] == plots[-RING - 1].t_s
-    np.testing.assert_allclose(f.lag_x[0], short.x[0], rtol=1e-12)
-    np.testing.assert_allclose(f.lag_counts[0], short.counts[0], rtol=1e-12)
+    assert f.lag.t_s[0] == plots[-RING - 1].t_s
+    np.testing.assert_allclose(f.lag.x[0], short.head.x[0], rtol=1e-12)
+    np.testing.assert_allclose(f.lag.counts[0], short.head.counts[0], rtol=1e-12)
 
 
 def test_a_plot_older_than_the_lagged_state_is_refused_and_changes_nothing() -> None:
     plots = random_walk(np.random.default_rng(2), 15)
     f = fed(MODELS, plots)
     before = copied(f)
-    assert not feed_row(MODELS, f, 0, plots[3]._replace(t_s=float(f.lag_t_s[0]) - 1e-6))
+    assert not feed_row(MODELS, f, 0, plots[3]._replace(t_s=float(f.lag.t_s[0]) - 1e-6))
     assert same(f, before)
-    assert feed_row(MODELS, f, 0, plots[3]._replace(t_s=float(f.lag_t_s[0])))
+    assert feed_row(MODELS, f, 0, plots[3]._replace(t_s=float(f.lag.t_s[0])))
 
 
 def test_a_plot_of_the_same_time_comes_after_those_that_are_there() -> None:
@@ -121,25 +124,25 @@ def test_a_late_plot_into_a_full_ring_moves_straight_into_the_lagged_state() -> 
     hidden = plots[5]
     f = fed(DIRICHLET, plots[:5] + plots[6:])
     assert f.ring_n[0] == RING
-    assert f.lag_t_s[0] < hidden.t_s < f.ring_t_s[0, 0]
+    assert f.lag.t_s[0] < hidden.t_s < f.ring_t_s[0, 0]
     assert feed_row(DIRICHLET, f, 0, hidden)
     assert f.ring_n[0] == RING
-    assert f.lag_t_s[0] == hidden.t_s
-    np.testing.assert_allclose(f.x[0], fed(DIRICHLET, plots).x[0], rtol=1e-12, atol=1e-9)
+    assert f.lag.t_s[0] == hidden.t_s
+    np.testing.assert_allclose(f.head.x[0], fed(DIRICHLET, plots).head.x[0], rtol=1e-12, atol=1e-9)
 
 
 def test_rows_keep_to_themselves() -> None:
     rng = np.random.default_rng(5)
     one, other = random_walk(rng, 10), random_walk(rng, 10)
-    f = make_filters(3, 3, RING)
+    f = make_filters(MODELS, 3, RING)
     begin_row(MODELS, f, 0, one[0])
     begin_row(MODELS, f, 2, other[0])
     for a, b in zip(one[1:], other[1:], strict=True):
         z, R, t = np.stack([b.z, a.z]), np.stack([b.R, a.R]), np.array([b.t_s, a.t_s])
         assert tracks.feed(MODELS, f, np.array([2, 0]), z, R, t, 7).all()
     for row, plots in ((0, one), (2, other)):
-        np.testing.assert_array_equal(f.x[row], fed(MODELS, plots).x[0])
-    assert not f.x[1].any()
+        np.testing.assert_array_equal(f.head.x[row], fed(MODELS, plots).head.x[0])
+    assert not f.head.x[1].any()
     assert set(f.ring_sensor[[0, 2]].ravel().tolist()) == {7}
 
 
@@ -167,41 +170,52 @@ def test_the_ring_of_one_track_feeds_another() -> None:
     assert same(f, want)
 
 
+def test_joined_rows_are_the_rows_of_both() -> None:
+    plots = random_walk(np.random.default_rng(12), 10)
+    one, other = fed(TVIMM, plots), fed(TVIMM, plots[3:])
+    whole = join_rows(one, other)
+    assert same(whole, one, 0)
+    assert all(np.array_equal(a, b) for a, b in zip(meaning(whole, 1), meaning(other, 0), strict=True))
+
+
 # --- prediction ---
 
 
+@pytest.mark.parametrize("models", [DIRICHLET, TVIMM], ids=["dirichlet", "tvimm"])
 @LAW
-@given(seeds, st.floats(0.0, 60.0))
-def test_prediction_is_one_interaction_and_changes_nothing(seed: int, dt: float) -> None:
-    f = fed(DIRICHLET, random_walk(np.random.default_rng(seed), 10))
+@given(seed=seeds, dt=st.floats(0.0, 60.0))
+def test_prediction_is_one_interaction_and_changes_nothing(models: Models, seed: int, dt: float) -> None:
+    f = fed(models, random_walk(np.random.default_rng(seed), 10))
     before = copied(f)
-    t = f.t_s + dt
-    got, known = predicted(DIRICHLET, f, ROW, t)
-    want = head(f)
-    interact(DIRICHLET, *want, float(t[0] - f.t_s[0]), *scratch(3))
+    t = f.head.t_s + dt
+    got, mu, known = predicted(models, f, ROW, t)
+    want = interacted(models, head(f), float(t[0]))
     assert known.all()
-    for a, b in zip(got[:3], want[:3], strict=True):
-        np.testing.assert_allclose(a[0], b, rtol=1e-12, atol=1e-12)
+    for a, b in zip(got, want, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+    branch = np.repeat(np.arange(len(models.split_s)), np.diff(models.first))
+    np.testing.assert_allclose(mu[0], want.mu[0] * want.weight[0, branch], rtol=1e-12)
     assert same(f, before)
 
 
+@pytest.mark.parametrize("models", NAMED.values(), ids=NAMED)
 @LAW
-@given(seeds, st.integers(0, RING - 1), st.floats(0.0, 0.99))
-def test_the_past_is_what_filtering_up_to_then_gave(seed: int, back: int, share: float) -> None:
+@given(seed=seeds, back=st.integers(0, RING - 1), share=st.floats(0.0, 0.99))
+def test_the_past_is_what_filtering_up_to_then_gave(models: Models, seed: int, back: int, share: float) -> None:
     plots = random_walk(np.random.default_rng(seed), 15)
-    f = fed(DIRICHLET, plots)
+    f = fed(models, plots)
     upto = len(plots) - 2 - back
     t = plots[upto].t_s + share * (plots[upto + 1].t_s - plots[upto].t_s)
-    now, known = predicted(DIRICHLET, f, ROW, np.array([t]))
-    then, _ = predicted(DIRICHLET, fed(DIRICHLET, plots[: upto + 1]), ROW, np.array([t]))
+    now, now_mu, known = predicted(models, f, ROW, np.array([t]))
+    then, then_mu, _ = predicted(models, fed(models, plots[: upto + 1]), ROW, np.array([t]))
     assert known.all()
-    for a, b in zip(now[:3], then[:3], strict=True):
+    for a, b in zip((*now, now_mu), (*then, then_mu), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-9)
 
 
 def test_before_the_lagged_state_there_is_no_answer() -> None:
     f = fed(MODELS, random_walk(np.random.default_rng(8), 15))
-    _, known = predicted(MODELS, f, np.array([0, 0]), np.array([f.lag_t_s[0] - 1e-3, f.lag_t_s[0]]))
+    _, _, known = predicted(MODELS, f, np.array([0, 0]), np.array([f.lag.t_s[0] - 1e-3, f.lag.t_s[0]]))
     assert known.tolist() == [False, True]
 
 
@@ -210,7 +224,7 @@ def test_before_the_lagged_state_there_is_no_answer() -> None:
 def test_moments_are_those_of_each_mixture(seed: int) -> None:
     rng = np.random.default_rng(seed)
     x, P, mu = rng.normal(size=(3, 2, 4)), covariances(rng, (3, 2), 4), rng.dirichlet([1, 1], 3)
-    mean, covariance = tracks.moments(x, P, mu)
+    mean, covariance = tracks.estimates(TVIMM, x, P, mu)
     for k in range(3):
         for got, want in zip((mean[k], covariance[k]), mixture_moments(x[k], P[k], mu[k]), strict=True):
             np.testing.assert_allclose(got, want, atol=1e-9)
@@ -221,61 +235,76 @@ def test_a_new_track_stands_at_its_plot() -> None:
     f = fresh_filters(MODELS, plot)
     want = np.zeros((4, 4))
     want[:2, :2], want[2:, 2:] = [[4.0, 1.0], [1.0, 9.0]], 150.0**2 * np.eye(2)
-    assert np.array_equal(f.x[0], np.tile([100.0, -50.0, 0.0, 0.0], (3, 1)))
-    assert np.array_equal(f.P[0], np.tile(want, (3, 1, 1)))
-    assert f.mu[0].tolist() == MODELS.mu0.tolist()
-    assert (f.t_s[0], f.lag_t_s[0], f.ring_n[0]) == (3.0, 3.0, 0)
+    assert np.array_equal(f.head.x[0], np.tile([100.0, -50.0, 0.0, 0.0], (3, 1)))
+    assert np.array_equal(f.head.P[0], np.tile(want, (3, 1, 1)))
+    assert f.head.mu[0].tolist() == MODELS.start.tolist()
+    assert (f.head.t_s[0], f.lag.t_s[0], f.ring_n[0]) == (3.0, 3.0, 0)
+
+
+def test_a_new_track_has_its_own_parameters_at_their_prior() -> None:
+    f = fresh_filters(TVIMM, Plot(np.array([100.0, -50.0]), np.array([4.0, 1.0, 9.0]), 3.0))
+    w = np.deg2rad(6.0)
+    np.testing.assert_allclose(f.head.x[0, :5, 4], [0.0, 0.55 * w, -0.55 * w, 0.0, 0.0])
+    np.testing.assert_allclose(f.head.P[0, [1, 2, 3, 4], 4, 4], [(0.23 * w) ** 2, (0.23 * w) ** 2, 36.0, 100.0])
+    assert f.head.P[0, 4, 5, 5] == f.head.P[0, 4, 4, 4]
+    assert not f.head.P[0, :, :4, 4:].any()
+    assert f.head.weight[0].tolist() == [0.5, 0.5]
+    assert not f.head.age_s[0].any()
 
 
 # --- the quick bound before the gate ---
 
 
-def many(rng: np.random.Generator, n: int) -> tuple[Filters, FloatArray]:
+def many(models: Models, rng: np.random.Generator, n: int) -> tuple[Filters, FloatArray]:
     """n tracks of different ages in a square of 20 km, and the time of the newest."""
-    f = make_filters(n, 3, RING)
+    f = make_filters(models, n, RING)
     newest = 0.0
     for row in range(n):
         shift = rng.uniform(0, 2e4, 2)
         plots = [p._replace(z=p.z + shift) for p in random_walk(rng, int(rng.integers(1, 8)), 10 ** rng.uniform(1, 3))]
-        begin_row(MODELS, f, row, plots[0])
+        begin_row(models, f, row, plots[0])
         for plot in plots[1:]:
-            feed_row(MODELS, f, row, plot)
+            feed_row(models, f, row, plot)
         newest = max(newest, plots[-1].t_s)
     return f, np.array(newest)
 
 
+@pytest.mark.parametrize("models", [MODELS, TVIMM], ids=["imm", "tvimm"])
 @LAW
-@given(seeds, st.integers(1, 8), st.floats(0.0, 20.0), st.sampled_from([0.0, 0.0, 3.0]))
-def test_no_track_with_a_plot_in_its_gate_is_left_out(seed: int, m: int, wait: float, spread_s: float) -> None:
-    rng = np.random.default_rng(seed)
-    f, newest = many(rng, 12)
+@given(seed=seeds, m=st.integers(1, 8), wait=st.floats(0.0, 20.0), spread_s=st.sampled_from([0.0, 0.0, 3.0]))
+def test_no_track_with_a_plot_in_its_gate_is_left_out(
+    models: Models, seed: int, m: int, wait: float, spread_s: float
+) -> None:
+    rng, r = np.random.default_rng(seed), len(models.kind)
+    f, newest = many(models, rng, 12)
     rows, limit = np.arange(12), 16.0
     t = newest + wait + rng.uniform(0, 1, m) * spread_s
     # Plots at the very edge: on the ellipse of some model of some track.
-    ahead, _ = predicted(MODELS, f, rows, np.full(12, t.mean()))
+    ahead, mu, _ = predicted(models, f, rows, np.full(12, t.mean()))
     R = packed(covariances(rng, (m,), 2, 10 ** rng.uniform(1, 5)))
     z = np.empty((m, 2))
     for j in range(m):
-        i, a = int(rng.integers(12)), int(rng.integers(3))
+        i, a = int(rng.integers(12)), int(rng.integers(r))
         S = ahead.P[i, a, :2, :2] + [[R[j, 0], R[j, 1]], [R[j, 1], R[j, 2]]]
         angle = rng.uniform(0, 2 * np.pi)
         out = np.linalg.cholesky(S) @ [np.cos(angle), np.sin(angle)] * np.sqrt(limit) * 0.9999
-        z[j] = ahead.x[i, a, :2] + out + (t[j] - t.mean()) * ahead.x[i, a, 2:]
+        z[j] = ahead.x[i, a, :2] + out + (t[j] - t.mean()) * ahead.x[i, a, 2:4]
     times = np.full(12, t.mean())
-    inside, _, _ = gating.gate(ahead.x, ahead.P, ahead.mu, times, z, R, t, limit)
+    inside, _, _ = gating.gate(ahead.x, ahead.P, mu, times, z, R, t, limit)
     assert len(inside) >= m
-    near = tracks.near(f, rows, z, R, t, float(MODELS.q.max()), limit)
+    near = tracks.near(models, f, rows, z, R, t, limit)
     assert set(inside.tolist()) <= set(near.tolist())
 
 
-def test_tracks_far_from_all_plots_are_left_out() -> None:
-    f, newest = many(np.random.default_rng(9), 12)
+@pytest.mark.parametrize("models", [MODELS, TVIMM], ids=["imm", "tvimm"])
+def test_tracks_far_from_all_plots_are_left_out(models: Models) -> None:
+    f, newest = many(models, np.random.default_rng(9), 12)
     z, R = np.array([[5e5, 5e5]]), np.array([[100.0, 0.0, 100.0]])
-    assert not len(tracks.near(f, np.arange(12), z, R, np.array([newest + 1.0]), 500.0, 16.0))
+    assert not len(tracks.near(models, f, np.arange(12), z, R, np.array([newest + 1.0]), 16.0))
 
 
 def test_each_row_gets_the_time_of_the_plot_nearest_to_it() -> None:
-    f = make_filters(2, 3, RING)
+    f = make_filters(MODELS, 2, RING)
     begin_row(MODELS, f, 0, Plot(np.array([0.0, 0.0]), np.array([1.0, 0.0, 1.0]), 0.0))
     begin_row(MODELS, f, 1, Plot(np.array([1000.0, 0.0]), np.array([1.0, 0.0, 1.0]), 0.0))
     z, t = np.array([[900.0, 50.0], [-300.0, 0.0], [5000.0, 0.0]]), np.array([1.0, 2.0, 3.0])

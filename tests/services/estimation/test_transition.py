@@ -7,18 +7,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.services.estimation.makers import LAW, FloatArray, sojourns
 
-from trackmesh.services.estimation.transition import chain, stationary, transition_matrix
+from trackmesh.services.estimation.transition import generator, stationary, transition_matrix
 
 times_s = st.floats(0.0, 1000.0)
 
 
 def matrix(sojourn_s: FloatArray, dt_s: float) -> FloatArray:
     out = np.empty((len(sojourn_s), len(sojourn_s)))
-    transition_matrix(chain(sojourn_s), dt_s, out)
+    transition_matrix(generator(sojourn_s), dt_s, out)
     return out
 
 
-def generator(sojourn_s: FloatArray) -> FloatArray:
+def written_out(sojourn_s: FloatArray) -> FloatArray:
     r = len(sojourn_s)
     G = np.tile(1.0 / (sojourn_s * max(r - 1, 1)), (r, 1)).T
     np.fill_diagonal(G, -1.0 / sojourn_s if r > 1 else 0.0)
@@ -36,7 +36,7 @@ def test_rows_are_probabilities(tau: FloatArray, dt: float) -> None:
 @LAW
 @given(sojourns, times_s)
 def test_equals_the_matrix_exponential(tau: FloatArray, dt: float) -> None:
-    np.testing.assert_allclose(matrix(tau, dt), scipy.linalg.expm(generator(tau) * dt), atol=1e-11)
+    np.testing.assert_allclose(matrix(tau, dt), scipy.linalg.expm(written_out(tau) * dt), atol=1e-11)
 
 
 @LAW
@@ -54,7 +54,7 @@ def test_no_time_no_transition(tau: FloatArray) -> None:
 @LAW
 @given(sojourns, times_s)
 def test_the_stationary_probabilities_stay_and_are_the_limit(tau: FloatArray, dt: float) -> None:
-    p = stationary(tau)
+    p = stationary(generator(tau))
     np.testing.assert_allclose(p @ matrix(tau, dt), p, atol=1e-12)
     np.testing.assert_allclose(matrix(tau, 1e6), np.tile(p, (len(tau), 1)), atol=1e-10)
 
@@ -68,4 +68,36 @@ def test_row_is_from_and_column_is_to() -> None:
 @pytest.mark.parametrize("tau", [[10.0, 0.0], [-1.0], [np.nan, 1.0]])
 def test_a_sojourn_time_that_is_not_positive_is_refused(tau: list[float]) -> None:
     with pytest.raises(ValueError, match="positive"):
-        chain(np.array(tau))
+        generator(np.array(tau))
+
+
+@LAW
+@given(st.integers(0, 2**32 - 1), st.integers(2, 6), times_s)
+def test_any_jumps_give_the_matrix_exponential(seed: int, r: int, dt: float) -> None:
+    """Chains that go round as well, whose generators have complex eigenvalues."""
+    rng = np.random.default_rng(seed)
+    J = rng.dirichlet(np.full(r, 0.3), r) * (1.0 - np.eye(r)) + np.roll(np.eye(r), 1, axis=1) * rng.uniform(0, 3)
+    J /= J.sum(axis=1, keepdims=True)
+    tau = rng.uniform(1.0, 100.0, r)
+    out = np.empty((r, r))
+    transition_matrix(generator(tau, J), dt, out)
+    np.testing.assert_allclose(out, scipy.linalg.expm((J - np.eye(r)) / tau[:, None] * dt), atol=1e-11)
+
+
+def test_a_chain_without_eigenvectors() -> None:
+    J, tau = np.array([[0.0, 1.0, 0.0], [0.5, 0.0, 0.5], [0.0, 1.0, 0.0]]), np.array([1.0, 1.0, 1.0])
+    J[2], J[0] = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
+    for dt in (0.1, 3.0, 1e6, 1e300):
+        out = np.empty((3, 3))
+        transition_matrix(generator(tau, J), dt, out)
+        np.testing.assert_allclose(out.sum(axis=1), 1.0, atol=1e-14)
+        if dt < 1e6:
+            np.testing.assert_allclose(out, scipy.linalg.expm((J - np.eye(3)) * dt), atol=1e-13)
+        else:
+            np.testing.assert_allclose(out, np.tile(stationary(generator(tau, J)), (3, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize("J", [np.eye(2), np.ones((2, 2)), [[0.0, 0.5], [1.0, 0.0]], np.ones((3, 3))])
+def test_jumps_that_are_none_are_refused(J: FloatArray) -> None:
+    with pytest.raises(ValueError, match="jumps must be"):
+        generator(np.ones(2), np.asarray(J))

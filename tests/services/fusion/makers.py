@@ -12,7 +12,8 @@ import pytest
 
 from trackmesh.protocol.codec import decode, encode
 from trackmesh.protocol.messages import PlotBatch, ScanPart, SensorInfo, TrackFrame
-from trackmesh.services.estimation.imm import make_models
+from trackmesh.services.estimation.bank import make_models
+from trackmesh.services.estimation.filters import velocity_models
 from trackmesh.services.fusion.engine import FusionEngine, Unit
 from trackmesh.services.fusion.layer import Layer, Look, Plots
 from trackmesh.services.fusion.life import Rules
@@ -191,7 +192,8 @@ def short_run() -> list[list[float]]:
 
 
 def layer(rules: Rules = RULES, sensors: int = 1, ring: int = 6, rows: int = 64) -> Layer:
-    return Layer(make_models(np.array([10.0, 500.0]), np.array([30.0, 15.0])), rules, ring, sensors, 16.0, 150.0, rows)
+    models = make_models((velocity_models([10.0, 500.0], [30.0, 15.0]),))
+    return Layer(models, rules, ring, sensors, 16.0, 150.0, rows)
 
 
 def look(t_s: float, **change: Any) -> Look:

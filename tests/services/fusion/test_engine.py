@@ -108,7 +108,8 @@ def test_frames_count_up_and_name_who_made_them() -> None:
     assert all(a.t_ns <= b.t_ns for a, b in pairwise(frames))
     last = frames[-1]
     assert (last.unit_id, last.boot_id, last.sensors) == ("main", "test", ["north", "east"])
-    assert last.models == ["cv-1", "cv-50", "cv-500"]
+    manoeuvre = ["cv", "turn-left", "turn-right", "speed-change", "singer"]
+    assert last.models == [*manoeuvre, "generic-cv", "generic-singer", "generic-rough"]
     assert set((last.track_id >> 41).tolist()) == {3}
 
 
@@ -158,7 +159,7 @@ def test_only_confirmed_tracks_are_shown_unless_told() -> None:
     assert not ids(frames[-1], CONFIRMED) & ids(shown), "the number of a tentative track is not that of the confirmed"
 
 
-@pytest.mark.parametrize("kind", ["imm", "tvimm-dirichlet"])
+@pytest.mark.parametrize("kind", ["imm", "tvimm-dirichlet", "tvimm-paper"])
 @pytest.mark.parametrize("models", [1, 2, 4])
 def test_every_filter_can_be_chosen(kind: str, models: int) -> None:
     change = {"q_m2ps3": [1.0, 10.0, 50.0, 500.0][:models], "sojourn_s": [30.0] * models}

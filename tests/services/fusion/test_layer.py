@@ -56,12 +56,12 @@ def test_confirmed_tracks_choose_first() -> None:
 def test_the_score_is_the_likelihood_ratio() -> None:
     bank, density = layer(), 1e-9
     first = step(bank, 0.0, (0, 0)).row[0]
-    x, P, mu = (a[first].copy() for a in (bank.filters.x, bank.filters.P, bank.filters.mu))
+    x, P, mu = (a[first].copy() for a in (bank.filters.head.x, bank.filters.head.P, bank.filters.head.mu))
     place: FloatArray = np.array([120.0, -80.0])
     ahead, covariance, weight = bank.predict(np.array([first]), 4.0)
     assert x[:, 0].tolist() == [0.0, 0.0]
     likelihood = 0.0
-    for q, w in zip(bank.models.q, weight[0], strict=True):
+    for q, w in zip(bank.models.numbers[:, 0], weight[0], strict=True):
         # Both models start alike; only their process noise differs.
         S = P[0][:2, :2] + 16.0 * P[0][2:, 2:] + (q * 64.0 / 3.0 + 2500.0) * np.eye(2)
         likelihood += w * scipy.stats.multivariate_normal(np.zeros(2), S).pdf(place)
@@ -133,7 +133,7 @@ def test_the_bank_grows_and_tracks_stay_in_their_rows() -> None:
     second = step(bank, 4.0, *places)
     assert second.row.tolist() == first.row.tolist()
     assert bank.life.hits[first.row].tolist() == [2] * 100
-    assert len(bank.life.uid) == len(bank.filters.t_s) == 128
+    assert len(bank.life.uid) == len(bank.filters.head.t_s) == 128
 
 
 def test_sensors_can_be_added_while_tracks_live() -> None:
@@ -168,11 +168,11 @@ def test_late_plots_reach_their_track_and_too_late_ones_do_not_move_it() -> None
     for t in times:
         in_order.step(plots(t, np.array([(100 * t, 0.0)])), look(t), t)
     assert late.rows.tolist() == in_order.rows.tolist()
-    assert np.array_equal(late.filters.x, in_order.filters.x)
-    before = late.filters.x[late.rows[0]].copy()
+    assert np.array_equal(late.filters.head.x, in_order.filters.head.x)
+    before = late.filters.head.x[late.rows[0]].copy()
     done = late.step(plots(0.5, np.array([(50.0, 0.0)])), look(0.5), 16.0)
     assert done.row[0] != late.rows[0]
-    assert np.array_equal(late.filters.x[late.rows[0]], before)
+    assert np.array_equal(late.filters.head.x[late.rows[0]], before)
 
 
 def test_plots_of_one_batch_may_have_their_own_times() -> None:
@@ -182,7 +182,7 @@ def test_plots_of_one_batch_may_have_their_own_times() -> None:
         both = plots(0.0, np.array([(speed * t[0], 0.0), (0.0, 3e4 - speed * t[1])]))._replace(t_s=t)
         done = bank.step(both, look(4.0 * turn + 3.5), 4.0 * turn + 3.5)
     assert bank.life.confirmed[done.row].all()
-    assert bank.filters.t_s[done.row].tolist() == [16.5, 19.5]
+    assert bank.filters.head.t_s[done.row].tolist() == [16.5, 19.5]
     mean, _, _ = bank.predict(done.row, 20.0)
     np.testing.assert_allclose(mean[:, :2], [[5000, 0], [0, 25000]], atol=60)
 

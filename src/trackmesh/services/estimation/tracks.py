@@ -1,20 +1,22 @@
 """Many tracks: filters with a short memory of plots, so that late plots replay exactly.
 
-Each row of ``Filters`` holds one track: the head state at its last plot, the same filter ``k`` plots ago (the lagged
-state), and the ring of plots in between, in time order. Stored state moves only when a plot is fed; prediction is
-read-only, to any time, per track. A late plot is put into the ring at its place and the head is filtered again from the
-lagged state: the result is what filtering in order would have given. A plot older than the lagged state is refused.
+Each row holds one track: the head (the filter at its last plot), the same filter some plots ago (the lagged state), and
+the ring of plots in between, in time order. Stored state moves only when a plot is fed; prediction is read-only, to any
+time, per track. A late plot is put into the ring at its place and the head is filtered again from the lagged state: the
+result is what filtering in order would have given. A plot older than the lagged state is refused.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from trackmesh.services.estimation.imm import Models, filter_plot, interact, moment_match
+from trackmesh.services.estimation import imm, printed
+from trackmesh.services.estimation.bank import Models, State, Work, make_state
 from trackmesh.services.estimation.jit import kernel
+from trackmesh.services.estimation.motion import own_acceleration
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -22,28 +24,18 @@ BoolArray = npt.NDArray[np.bool_]
 
 
 class Filters(NamedTuple):
-    """The filters of n rows (r models, d states, rings of k plots); a row means nothing before ``begin``.
+    """The filters of n rows with rings of k plots; a row means nothing before ``begin``.
 
     Attributes:
-        x, P, mu, counts, t_s: head: (n, r, d), (n, r, d, d), (n, r), (n, r, r), (n,).
-        lag_x, lag_P, lag_mu, lag_counts, lag_t_s: the lagged state, likewise.
-        ring_z, ring_R, ring_t_s, ring_sensor, ring_n: plots after the lagged state: (n, k, 2), (n, k, 3), (n, k),
-            (n, k), (n,).
-        mean: (n, d) mean state of the head.
+        head: at the last plot. lag: before the plots of the ring.
+        ring_z, ring_R, ring_t_s, ring_sensor, ring_n: the plots: (n, k, 2), (n, k, 3), (n, k), (n, k), (n,).
+        mean: (n, 4) mean position and velocity of the head.
         spread: (n, 3) greatest variance of position, its covariance with velocity, and variance of velocity, for a
             quick bound of where the track can be.
     """
 
-    x: FloatArray
-    P: FloatArray
-    mu: FloatArray
-    counts: FloatArray
-    t_s: FloatArray
-    lag_x: FloatArray
-    lag_P: FloatArray
-    lag_mu: FloatArray
-    lag_counts: FloatArray
-    lag_t_s: FloatArray
+    head: State
+    lag: State
     ring_z: FloatArray
     ring_R: FloatArray
     ring_t_s: FloatArray
@@ -53,14 +45,29 @@ class Filters(NamedTuple):
     spread: FloatArray
 
 
-def make_filters(n: int, r: int, k: int, d: int = 4) -> Filters:
-    """Filters with n empty rows, r models and rings of k plots."""
-    whole = {"ring_sensor": (n, k), "ring_n": (n,)}
-    state = {"x": (n, r, d), "P": (n, r, d, d), "mu": (n, r), "counts": (n, r, r), "t_s": (n,)}
-    real: dict[str, tuple[int, ...]] = state | {f"lag_{name}": shape for name, shape in state.items()}
-    real |= {"ring_z": (n, k, 2), "ring_R": (n, k, 3), "ring_t_s": (n, k), "mean": (n, d), "spread": (n, 3)}
-    arrays: dict[str, npt.NDArray[Any]] = {name: np.zeros(shape) for name, shape in real.items()}
-    return Filters(**arrays | {name: np.zeros(shape, np.int64) for name, shape in whole.items()})
+def make_filters(models: Models, n: int, k: int) -> Filters:
+    """Filters with n empty rows and rings of k plots."""
+    return Filters(
+        head=make_state(models, n),
+        lag=make_state(models, n),
+        ring_z=np.zeros((n, k, 2)),
+        ring_R=np.zeros((n, k, 3)),
+        ring_t_s=np.zeros((n, k)),
+        ring_sensor=np.zeros((n, k), np.int64),
+        ring_n=np.zeros(n, np.int64),
+        mean=np.zeros((n, 4)),
+        spread=np.zeros((n, 3)),
+    )
+
+
+def join_rows(first: Filters, second: Filters) -> Filters:
+    """The rows of both."""
+    head, lag = (
+        State(*(np.concatenate(both) for both in zip(a, b, strict=True)))
+        for a, b in ((first.head, second.head), (first.lag, second.lag))
+    )
+    rest = {n: np.concatenate((getattr(first, n), getattr(second, n))) for n in Filters._fields[2:]}
+    return Filters(head, lag, **rest)
 
 
 @kernel
@@ -73,24 +80,12 @@ def begin(
     t_s: FloatArray,
     sigma_v_mps: float,
 ) -> None:
-    """Start tracks in ``rows`` from single plots: at the plot, at rest, with ``sigma_v_mps`` per axis of velocity."""
-    r, d = f.x.shape[1:]
+    """Start tracks in ``rows`` from single plots, see ``imm.begin``."""
     for k in range(len(rows)):
-        i = rows[k]
-        for j in range(r):
-            f.x[i, j, :] = 0.0
-            f.P[i, j, :, :] = 0.0
-            f.x[i, j, 0], f.x[i, j, 1] = z[k, 0], z[k, 1]
-            f.P[i, j, 0, 0], f.P[i, j, 1, 1] = R[k, 0], R[k, 2]
-            f.P[i, j, 0, 1] = f.P[i, j, 1, 0] = R[k, 1]
-            for a in range(2, d):
-                f.P[i, j, a, a] = sigma_v_mps**2
-            f.mu[i, j] = models.mu0[j]
-        f.counts[i] = 0.0
-        f.t_s[i] = t_s[k]
-        _copy_head_to_lag(f, i)
-        f.ring_n[i] = 0
-        _summarise(f, i)
+        imm.begin(models, f.head, rows[k], z[k], R[k], t_s[k], sigma_v_mps)
+        imm.copy_row(f.head, rows[k], f.lag, rows[k])
+        f.ring_n[rows[k]] = 0
+        _summarise(models, f, rows[k])
 
 
 @kernel
@@ -104,22 +99,21 @@ def feed(
     sensor: int,
 ) -> BoolArray:
     """Feed plot k to row ``rows[k]``, in order or late; False where the plot is older than the row's lagged state."""
-    r, d = f.x.shape[1:]
-    pi, mx, mP = np.empty((r, r)), np.empty((r, d)), np.empty((r, d, d))
+    w = imm.make_work(models, f.head.x.shape[2])
     taken = np.ones(len(rows), np.bool_)
     for k in range(len(rows)):
         i = rows[k]
-        if t_s[k] >= f.t_s[i]:
-            _insert(models, f, i, z[k], R[k], t_s[k], sensor, pi, mx, mP)
-            filter_plot(models, f.x[i], f.P[i], f.mu[i], f.counts[i], t_s[k] - f.t_s[i], z[k], R[k], pi, mx, mP)
-            f.t_s[i] = t_s[k]
-        elif t_s[k] >= f.lag_t_s[i]:
-            _insert(models, f, i, z[k], R[k], t_s[k], sensor, pi, mx, mP)
-            _replay(models, f, i, pi, mx, mP)
-        else:
+        if t_s[k] < f.lag.t_s[i]:
             taken[k] = False
             continue
-        _summarise(f, i)
+        in_order = t_s[k] >= f.head.t_s[i]
+        _insert(models, f, i, z[k], R[k], t_s[k], sensor, w)
+        if in_order:
+            imm.filter_plot(models, f.head, i, z[k], R[k], t_s[k], w)
+        else:
+            imm.copy_row(f.lag, i, f.head, i)
+            _replay(models, f, i, f.head, i, np.inf, w)
+        _summarise(models, f, i)
     return taken
 
 
@@ -140,15 +134,7 @@ def feed_ring(models: Models, f: Filters, source: int, target: int) -> None:
 
 
 @kernel
-def predict(
-    models: Models,
-    f: Filters,
-    rows: IntArray,
-    t_s: FloatArray,
-    x: FloatArray,
-    P: FloatArray,
-    mu: FloatArray,
-) -> BoolArray:
+def predict(models: Models, f: Filters, rows: IntArray, t_s: FloatArray, out: State, mu: FloatArray) -> BoolArray:
     """Prediction of rows to their times, model by model, without changing them.
 
     A time before a row's last plot is answered by filtering its ring up to that time; before its lagged state there is
@@ -156,51 +142,50 @@ def predict(
 
     Args:
         rows: (m,) rows. t_s: (m,) times.
-        x, P, mu: (m, r, d), (m, r, d, d), (m, r), written.
+        out: m rows, written. mu: (m, r) probability of every model over all branches, written.
 
     Returns:
         (m,) whether there is an answer.
     """
-    r, d = f.x.shape[1:]
-    pi, mx, mP, counts = np.empty((r, r)), np.empty((r, d)), np.empty((r, d, d)), np.empty((r, r))
+    w = imm.make_work(models, f.head.x.shape[2])
     known = np.ones(len(rows), np.bool_)
     for k in range(len(rows)):
         i = rows[k]
-        if t_s[k] >= f.t_s[i]:
-            x[k], P[k], mu[k], counts[:] = f.x[i], f.P[i], f.mu[i], f.counts[i]
-            last = f.t_s[i]
-        elif t_s[k] >= f.lag_t_s[i]:
-            x[k], P[k], mu[k], counts[:] = f.lag_x[i], f.lag_P[i], f.lag_mu[i], f.lag_counts[i]
-            last = f.lag_t_s[i]
-            for h in range(f.ring_n[i]):
-                if f.ring_t_s[i, h] > t_s[k]:
-                    break
-                dt = f.ring_t_s[i, h] - last
-                filter_plot(models, x[k], P[k], mu[k], counts, dt, f.ring_z[i, h], f.ring_R[i, h], pi, mx, mP)
-                last = f.ring_t_s[i, h]
+        if t_s[k] >= f.head.t_s[i]:
+            imm.copy_row(f.head, i, out, k)
+        elif t_s[k] >= f.lag.t_s[i]:
+            imm.copy_row(f.lag, i, out, k)
+            _replay(models, f, i, out, k, t_s[k], w)
         else:
             known[k] = False
-            x[k], P[k], mu[k] = 0.0, 0.0, 0.0
             continue
-        interact(models, x[k], P[k], mu[k], counts, t_s[k] - last, pi, mx, mP)
+        imm.interact(models, out, k, t_s[k], w)
+        imm.probabilities(models, out, k, mu[k])
     return known
 
 
 @kernel
-def moments(x: FloatArray, P: FloatArray, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Moment-match m mixtures: (m, r, d), (m, r, d, d), (m, r) to means (m, d) and covariances (m, d, d)."""
-    m, _, d = x.shape
-    mean, covariance = np.empty((m, d)), np.empty((m, d, d))
+def estimates(models: Models, x: FloatArray, P: FloatArray, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """One estimate of each of m mixtures over position and velocity: means (m, 4) and covariances (m, 4, 4).
+
+    Moment-matched; the printed TV-IMM takes the product of its models instead.
+    """
+    m = len(mu)
+    mean, covariance = np.empty((m, 4)), np.empty((m, 4, 4))
     for k in range(m):
-        moment_match(x[k], P[k], mu[k], mean[k], covariance[k])
+        if models.printed:
+            printed.product_of_gaussians(x[k], P[k], mean[k], covariance[k])
+        else:
+            imm.moment_match(x[k], P[k], mu[k], mean[k], covariance[k])
     return mean, covariance
 
 
 @kernel
 def near(
-    f: Filters, rows: IntArray, z: FloatArray, R: FloatArray, t_s: FloatArray, q_max: float, limit: float
+    models: Models, f: Filters, rows: IntArray, z: FloatArray, R: FloatArray, t_s: FloatArray, limit: float
 ) -> IntArray:
     """The rows that may have a plot in their gate: a generous circle around each touches the plots' bounding box."""
+    q_max = models.numbers[:, 0].max()
     m = len(z)
     east0 = north0 = early = np.inf
     east1 = north1 = late = -np.inf
@@ -213,10 +198,12 @@ def near(
     chosen = np.empty(len(rows), np.int64)
     n = 0
     for i in rows:
-        dt = (early + late) / 2.0 - f.t_s[i]
+        dt = (early + late) / 2.0 - f.head.t_s[i]
         span = abs(dt) + (late - early) / 2.0
-        variance = f.spread[i, 0] + 2.0 * span * f.spread[i, 1] + span * span * f.spread[i, 2] + q_max * span**3
         speed = np.hypot(f.mean[i, 2], f.mean[i, 3])
+        drift = 0.5 * span * span * strongest_acceleration(models, speed)
+        variance = f.spread[i, 0] + 2.0 * span * f.spread[i, 1] + span * span * f.spread[i, 2] + q_max * span**3
+        variance += drift * drift
         reach = np.sqrt(limit * (variance + r_max)) + speed * (late - early) / 2.0
         if dt < 0.0:
             reach += speed * -dt
@@ -228,6 +215,15 @@ def near(
 
 
 @kernel
+def strongest_acceleration(models: Models, speed_mps: float) -> float:
+    """A bound over all models of the acceleration that their own parameters can mean."""
+    most = 0.0
+    for j in range(len(models.kind)):
+        most = max(most, own_acceleration(models.kind[j], models.numbers[j], speed_mps))
+    return most
+
+
+@kernel
 def nearest_times(f: Filters, rows: IntArray, z: FloatArray, t_s: FloatArray) -> FloatArray:
     """The time of the plot nearest to each row, with the row moved to the plot's time: when the sensor looked at it."""
     out = np.empty(len(rows))
@@ -235,7 +231,7 @@ def nearest_times(f: Filters, rows: IntArray, z: FloatArray, t_s: FloatArray) ->
         i = rows[k]
         best = np.inf
         for j in range(len(z)):
-            dt = t_s[j] - f.t_s[i]
+            dt = t_s[j] - f.head.t_s[i]
             de = z[j, 0] - f.mean[i, 0] - dt * f.mean[i, 2]
             dn = z[j, 1] - f.mean[i, 1] - dt * f.mean[i, 3]
             if de * de + dn * dn < best:
@@ -244,25 +240,14 @@ def nearest_times(f: Filters, rows: IntArray, z: FloatArray, t_s: FloatArray) ->
 
 
 @kernel
-def _insert(
-    models: Models,
-    f: Filters,
-    i: int,
-    z: FloatArray,
-    R: FloatArray,
-    t_s: float,
-    sensor: int,
-    pi: FloatArray,
-    mx: FloatArray,
-    mP: FloatArray,
-) -> None:
+def _insert(models: Models, f: Filters, i: int, z: FloatArray, R: FloatArray, t_s: float, sensor: int, w: Work) -> None:
     """Put a plot into the ring in time order; when full, the oldest plot moves into the lagged state."""
     size = f.ring_t_s.shape[1]
     if f.ring_n[i] == size:
         if t_s < f.ring_t_s[i, 0]:
-            _advance_lag(models, f, i, z, R, t_s, pi, mx, mP)
+            imm.filter_plot(models, f.lag, i, z, R, t_s, w)
             return
-        _advance_lag(models, f, i, f.ring_z[i, 0], f.ring_R[i, 0], f.ring_t_s[i, 0], pi, mx, mP)
+        imm.filter_plot(models, f.lag, i, f.ring_z[i, 0], f.ring_R[i, 0], f.ring_t_s[i, 0], w)
         for h in range(1, size):
             _move_ring(f, i, h, h - 1)
         f.ring_n[i] -= 1
@@ -278,33 +263,12 @@ def _insert(
 
 
 @kernel
-def _advance_lag(
-    models: Models,
-    f: Filters,
-    i: int,
-    z: FloatArray,
-    R: FloatArray,
-    t_s: float,
-    pi: FloatArray,
-    mx: FloatArray,
-    mP: FloatArray,
-) -> None:
-    dt = t_s - f.lag_t_s[i]
-    filter_plot(models, f.lag_x[i], f.lag_P[i], f.lag_mu[i], f.lag_counts[i], dt, z, R, pi, mx, mP)
-    f.lag_t_s[i] = t_s
-
-
-@kernel
-def _replay(models: Models, f: Filters, i: int, pi: FloatArray, mx: FloatArray, mP: FloatArray) -> None:
-    f.x[i] = f.lag_x[i]
-    f.P[i] = f.lag_P[i]
-    f.mu[i] = f.lag_mu[i]
-    f.counts[i] = f.lag_counts[i]
-    f.t_s[i] = f.lag_t_s[i]
+def _replay(models: Models, f: Filters, i: int, state: State, k: int, until_s: float, w: Work) -> None:
+    """Filter the plots of row i's ring up to a time into row ``k`` of ``state``, which is the lagged state so far."""
     for h in range(f.ring_n[i]):
-        dt = f.ring_t_s[i, h] - f.t_s[i]
-        filter_plot(models, f.x[i], f.P[i], f.mu[i], f.counts[i], dt, f.ring_z[i, h], f.ring_R[i, h], pi, mx, mP)
-        f.t_s[i] = f.ring_t_s[i, h]
+        if f.ring_t_s[i, h] > until_s:
+            break
+        imm.filter_plot(models, state, k, f.ring_z[i, h], f.ring_R[i, h], f.ring_t_s[i, h], w)
 
 
 @kernel
@@ -316,26 +280,21 @@ def _move_ring(f: Filters, i: int, source: int, target: int) -> None:
 
 
 @kernel
-def _copy_head_to_lag(f: Filters, i: int) -> None:
-    f.lag_x[i] = f.x[i]
-    f.lag_P[i] = f.P[i]
-    f.lag_mu[i] = f.mu[i]
-    f.lag_counts[i] = f.counts[i]
-    f.lag_t_s[i] = f.t_s[i]
-
-
-@kernel
-def _summarise(f: Filters, i: int) -> None:
+def _summarise(models: Models, f: Filters, i: int) -> None:
     """Mean state and greatest variances of the head, for ``near``."""
-    r = f.mu.shape[1]
-    f.mean[i] = 0.0
-    for j in range(r):
-        f.mean[i] += f.mu[i, j] * f.x[i, j]
+    r = len(models.kind)
+    mu = np.empty(r)
+    imm.probabilities(models, f.head, i, mu)
+    for a in range(4):
+        f.mean[i, a] = 0.0
+        for j in range(r):
+            f.mean[i, a] += mu[j] * f.head.x[i, j, a]
     position = cross = velocity = 0.0
     for j in range(r):
-        de, dn = f.x[i, j, 0] - f.mean[i, 0], f.x[i, j, 1] - f.mean[i, 1]
-        dve, dvn = f.x[i, j, 2] - f.mean[i, 2], f.x[i, j, 3] - f.mean[i, 3]
-        position = max(position, f.P[i, j, 0, 0] + f.P[i, j, 1, 1] + de * de + dn * dn)
-        cross = max(cross, abs(f.P[i, j, 0, 2]) + abs(f.P[i, j, 1, 3]))
-        velocity = max(velocity, f.P[i, j, 2, 2] + f.P[i, j, 3, 3] + dve * dve + dvn * dvn)
+        de, dn = f.head.x[i, j, 0] - f.mean[i, 0], f.head.x[i, j, 1] - f.mean[i, 1]
+        dve, dvn = f.head.x[i, j, 2] - f.mean[i, 2], f.head.x[i, j, 3] - f.mean[i, 3]
+        P = f.head.P[i, j]
+        position = max(position, P[0, 0] + P[1, 1] + de * de + dn * dn)
+        cross = max(cross, abs(P[0, 2]) + abs(P[1, 3]))
+        velocity = max(velocity, P[2, 2] + P[3, 3] + dve * dve + dvn * dvn)
     f.spread[i, 0], f.spread[i, 1], f.spread[i, 2] = position, cross, velocity

@@ -220,7 +220,7 @@ class FusionEngine:
     def _local_tracks(self, local: Layer) -> LocalTracks:
         rows = local.rows
         rows = rows[local.life.hits[rows] >= _HITS_FOR_TEST]
-        x, P, _ = local.predict(rows, np.maximum(local.filters.t_s[rows], self._now_s))
+        x, P, _ = local.predict(rows, np.maximum(local.filters.head.t_s[rows], self._now_s))
         return LocalTracks(local.life.uid[rows] & NUMBER_MASK, x, P)
 
     def _join(self, a: int, b: int, number_a: IntArray, number_b: IntArray, pairs: DeclaredPairs) -> None:
@@ -245,7 +245,7 @@ class FusionEngine:
         if not (known.alive[one] and known.alive[other]):
             return
         pair = np.array([one, other])
-        x, P, _ = self._system.predict(pair, np.maximum(self._system.filters.t_s[pair], self._now_s))
+        x, P, _ = self._system.predict(pair, np.maximum(self._system.filters.head.t_s[pair], self._now_s))
         zero, first = np.zeros(1, np.int64), np.ones(1, np.int64)
         distance, _ = state_distances(x, P, x, P, zero, first)
         both = ((known.member[one] >= 0) & (known.member[other] >= 0)).any()
@@ -279,7 +279,7 @@ class FusionEngine:
         rows = self._system.rows
         if not tentative:
             rows = rows[self._system.life.confirmed[rows]]
-        rows = rows[self._system.filters.lag_t_s[rows] <= t_s]
+        rows = rows[self._system.filters.lag.t_s[rows] <= t_s]
         frame = self._frame_of(rows, t_s, self._seq if seq is None else seq)
         return frames.join(frame, ended) if ended else frame
 

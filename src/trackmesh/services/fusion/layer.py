@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from trackmesh.services.estimation import assignment, gating, tracks
-from trackmesh.services.estimation.imm import Models
-from trackmesh.services.estimation.tracks import Filters, make_filters
+from trackmesh.services.estimation.bank import Models, State, make_state
+from trackmesh.services.estimation.tracks import Filters, join_rows, make_filters
 from trackmesh.services.fusion import life as lives
 from trackmesh.services.fusion.life import Life, Rules, make_life
 
@@ -88,8 +88,7 @@ class Layer:
         self.sigma_v_mps = sigma_v_mps
         self._ring = ring
         self._next_uid = 0
-        self._q_max = float(models.q.max())
-        self.filters: Filters = make_filters(rows, len(models.q), ring)
+        self.filters: Filters = make_filters(models, rows, ring)
         self.life: Life = make_life(rows, sensors)
         self._free = list(range(rows - 1, -1, -1))
 
@@ -117,8 +116,8 @@ class Layer:
 
     def predict(self, rows: IntArray, t_s: float | FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Moment-matched states (m, 4), covariances (m, 4, 4) and model probabilities (m, r) of rows at their times."""
-        x, P, mu, _ = self._predict(rows, np.broadcast_to(np.asarray(t_s, float), len(rows)))
-        mean, covariance = tracks.moments(x, P, mu)
+        state, mu, _ = self._predict(rows, np.broadcast_to(np.asarray(t_s, float), len(rows)))
+        mean, covariance = tracks.estimates(self.models, state.x, state.P, mu)
         return mean, covariance, mu
 
     def judge(self, t_s: float) -> tuple[IntArray, list[tuple[int, int, int]]]:
@@ -148,11 +147,12 @@ class Layer:
     def _associate(
         self, alive: IntArray, plots: Plots, look: Look, row: IntArray, by_confirmed: npt.NDArray[np.bool_]
     ) -> int:
-        near = tracks.near(self.filters, alive, plots.z, plots.R, plots.t_s, self._q_max, self.gate)
+        near = tracks.near(self.models, self.filters, alive, plots.z, plots.R, plots.t_s, self.gate)
         if not len(near):
             return 0
         times = self._times(near, plots)
-        x, P, mu, known = self._predict(near, times)
+        state, mu, known = self._predict(near, times)
+        x, P = state.x, state.P
         if not known.all():
             near, times, x, P, mu = near[known], times[known], x[known], P[known], mu[known]
         i, j, cost = gating.gate(x, P, mu, times, plots.z, plots.R, plots.t_s, self.gate)
@@ -198,17 +198,14 @@ class Layer:
     def _miss(self, rows: IntArray, look: Look) -> None:
         log_miss = np.log(max(1.0 - look.p_detect, 1e-3))
         lives.miss(
-            self.life, rows, self.filters.mean, self.filters.t_s, look.t_s, look.sensor, look.site, look.max_range_m,
-            look.lately_s, look.period_s, look.margin_s, look.whole, log_miss,
+            self.life, rows, self.filters.mean, self.filters.head.t_s, look.t_s, look.sensor, look.site,
+            look.max_range_m, look.lately_s, look.period_s, look.margin_s, look.whole, log_miss,
         )  # fmt: skip
 
-    def _predict(
-        self, rows: IntArray, t_s: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, npt.NDArray[np.bool_]]:
-        n, (r, d) = len(rows), self.filters.x.shape[1:]
-        x, P, mu = np.empty((n, r, d)), np.empty((n, r, d, d)), np.empty((n, r))
-        known = tracks.predict(self.models, self.filters, rows, np.ascontiguousarray(t_s), x, P, mu)
-        return x, P, mu, known
+    def _predict(self, rows: IntArray, t_s: FloatArray) -> tuple[State, FloatArray, npt.NDArray[np.bool_]]:
+        state, mu = make_state(self.models, len(rows)), np.zeros((len(rows), len(self.models.kind)))
+        known = tracks.predict(self.models, self.filters, rows, np.ascontiguousarray(t_s), state, mu)
+        return state, mu, known
 
     def _take(self, n: int) -> IntArray:
         while len(self._free) < n:
@@ -219,8 +216,8 @@ class Layer:
 
     def _grow(self) -> None:
         have = len(self.life.uid)
-        more_filters = make_filters(have, len(self.models.q), self._ring)
+        more_filters = make_filters(self.models, have, self._ring)
         more_life = make_life(have, self.life.seen_s.shape[1])
-        self.filters = Filters(*(np.concatenate(pair) for pair in zip(self.filters, more_filters, strict=True)))
+        self.filters = join_rows(self.filters, more_filters)
         self.life = Life(*(np.concatenate(pair) for pair in zip(self.life, more_life, strict=True)))
         self._free = list(range(2 * have - 1, have - 1, -1)) + self._free

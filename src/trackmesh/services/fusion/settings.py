@@ -10,7 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from trackmesh.protocol.messages import Geodetic
 from trackmesh.protocol.messages.base import NonNegative, Positive
-from trackmesh.services.estimation.imm import Models, make_models
+from trackmesh.services.estimation.bank import Branch, Models, make_models
+from trackmesh.services.estimation.filters import FilterName, generic_models, manoeuvre_models, velocity_models
 from trackmesh.services.runtime import ServiceSettings
 
 
@@ -19,7 +20,7 @@ class EngineSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    filter: Literal["tvimm-dirichlet", "imm"] = Field("tvimm-dirichlet", description="the filter of every track")
+    filter: FilterName = Field("tvimm", description="the filter of every track")
     q_m2ps3: Annotated[list[Positive], Field(min_length=1, max_length=4)] = Field(
         [1.0, 50.0, 500.0], description="acceleration noise density of each constant-velocity model"
     )
@@ -29,6 +30,11 @@ class EngineSettings(BaseModel):
     tpm_prior_count: Positive = Field(20.0, description="weight of the sojourn times against observed transitions")
     tpm_memory_s: Positive = Field(80.0, description="how long observed transitions are remembered")
     tpm_reference_s: Positive = Field(4.0, description="interval whose expected transition counts as one")
+    turn_rate_max_degps: Positive = Field(6.0, description="tvimm: fastest turn expected; rather too high than too low")
+    acceleration_max_mps2: Positive = Field(10.0, description="tvimm: strongest acceleration expected")
+    manoeuvre_s: Positive = Field(18.0, description="tvimm: typical length of a manoeuvre")
+    quiet_s: Positive = Field(45.0, description="tvimm: typical time between manoeuvres")
+    q_quiet: Positive = Field(0.3, description="tvimm: acceleration noise of quiet flight, m/s^1.5")
     sigma_velocity_mps: Positive = Field(150.0, description="velocity of a new track, one sigma per axis")
     gate: Positive = Field(16.0, description="largest squared Mahalanobis distance of a plot to a track's model")
     confirm_score: Positive = Field(12.0, description="log-likelihood ratio that confirms a track")
@@ -57,13 +63,23 @@ class EngineSettings(BaseModel):
 
     def models(self) -> Models:
         """The models of the filter."""
-        prior = self.tpm_prior_count if self.filter == "tvimm-dirichlet" else np.inf
-        q, tau = np.array(self.q_m2ps3), np.array(self.sojourn_s)
-        return make_models(q, tau, prior, self.tpm_memory_s, self.tpm_reference_s)
+        return make_models(
+            self._branches(),
+            memory_s=self.tpm_memory_s,
+            reference_s=self.tpm_reference_s,
+            printed=self.filter == "tvimm-paper",
+        )
 
     def model_names(self) -> list[str]:
         """Names of the models in a frame."""
-        return [f"cv-{q:g}" for q in self.q_m2ps3]
+        return [model.name for branch in self._branches() for model in branch.models]
+
+    def _branches(self) -> tuple[Branch, ...]:
+        if self.filter == "tvimm":
+            words = (self.acceleration_max_mps2, self.manoeuvre_s, self.quiet_s, self.q_quiet)
+            return (manoeuvre_models(np.deg2rad(self.turn_rate_max_degps), *words), generic_models(*words))
+        prior = self.tpm_prior_count if self.filter == "tvimm-dirichlet" else np.inf
+        return (velocity_models(self.q_m2ps3, self.sojourn_s, prior),)
 
 
 class FusionSettings(ServiceSettings):
