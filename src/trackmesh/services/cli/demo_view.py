@@ -117,10 +117,9 @@ def demo_panel(state: DemoState) -> RenderableType:
     table.add_row("seconds", f"{state.elapsed_s:.0f}{left}")
     table.add_row("targets", str(len(state.truth[-1].id)) if state.truth else "-")
     table.add_row("tracks", str(len(_shown(last))) if last else "-")
-    table.add_row("GOSPA", f"{state.gospa_m:.0f} m (c = 1000 m)")
-    table.add_row("plots", f"{state.plots_per_s():.0f} a second")
-    latency = _latency(state)
-    table.add_row("plot to picture", latency)
+    table.add_row("GOSPA", _known(state.gospa_m, "m (c = 1000 m)"))
+    table.add_row("plots", _known(state.plots_per_s(), "a second"))
+    table.add_row("plot to picture", _latency(state))
     table.add_row("EMI", _emi_line(state))
     return Group(table, _service_table(state))
 
@@ -138,7 +137,7 @@ def demo_report(state: DemoState, world: Scenario, seed: int) -> Report:
         table.add_row("switches of quiet targets", f"{end.quiet_switches} on {end.quiet_targets} targets")
     except TrackmeshError as problem:
         error = str(problem)
-    table.add_row("GOSPA of the last frame", f"{state.gospa_m:.0f} m (c = 1000 m)")
+    table.add_row("GOSPA of the last frame", _known(state.gospa_m, "m (c = 1000 m)"))
     table.add_row("plot to picture", _latency(state))
     table.add_row("frames", str(len(state.frames)))
     table.add_row("EMI", _emi_line(state))
@@ -155,6 +154,10 @@ def _picture(state: DemoState, world: Scenario, seed: int) -> PictureAtEnd:
 def _shown(frame: TrackFrame) -> FloatArray:
     shown = (frame.status == CONFIRMED) | (frame.status == COASTING)
     return np.asarray(frame.state[shown, :2])
+
+
+def _known(value: float, unit: str) -> str:
+    return f"{value:.0f} {unit}" if math.isfinite(value) else "-"
 
 
 def _latency(state: DemoState) -> str:
@@ -184,5 +187,5 @@ def _service_table(state: DemoState) -> Table:
     for (kind, unit), s in sorted(state.statuses.items()):
         counted = ", ".join(f"{name} {n}" for name, n in sorted(s.counters.items()))
         refused = ", ".join(f"{name} {n}" for name, n in sorted(s.refused.items()))
-        table.add_row(kind, unit, s.state, counted, refused or "-")
+        table.add_row(kind, unit, s.state, counted or "-", refused or "-")
     return table

@@ -14,6 +14,7 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 _UPPER = np.triu_indices(6)
+_FLOAT32_MOST = float(np.finfo(np.float32).max)
 
 
 def pack_states(x: FloatArray, P: FloatArray) -> tuple[FloatArray, npt.NDArray[np.float32]]:
@@ -21,7 +22,8 @@ def pack_states(x: FloatArray, P: FloatArray) -> tuple[FloatArray, npt.NDArray[n
     n, d = x.shape
     state, full = np.zeros((n, 6)), np.zeros((n, 6, 6))
     state[:, :d], full[:, :d, :d] = x, P
-    return state, full[:, _UPPER[0], _UPPER[1]].astype("<f4")
+    # A prediction over a year is worth nothing, but must still be a message: it saturates.
+    return state, np.clip(full[:, _UPPER[0], _UPPER[1]], -_FLOAT32_MOST, _FLOAT32_MOST).astype("<f4")
 
 
 def status_of(layer: Layer, rows: IntArray, t_s: float, coasting_after_s: float) -> npt.NDArray[np.uint8]:
