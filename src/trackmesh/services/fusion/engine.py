@@ -16,6 +16,7 @@ import numpy.typing as npt
 from trackmesh.protocol.errors import RefusedMessage
 from trackmesh.protocol.messages import ENDED, Geodetic, PlotBatch, SensorInfo, TrackFrame, TrackQuery
 from trackmesh.services.estimation import tracks
+from trackmesh.services.estimation.bank import Models
 from trackmesh.services.estimation.lookup import index_of
 from trackmesh.services.estimation.pairs import PairRules, state_distances
 from trackmesh.services.fusion import frames, life, membership
@@ -67,7 +68,8 @@ class FusionEngine:
         self.counters: Counter[str] = Counter()
         self.sensors: dict[str, Sensor] = {}
         self._models = settings.models()
-        self._system = self._layer(self._rules(1.0, settings.coast_s), settings.ring_system, 1)
+        self._local_models = settings.local_models()
+        self._system = self._layer(self._models, self._rules(1.0, settings.coast_s), settings.ring_system)
         self._locals: list[Layer] = []
         self._tests: dict[tuple[int, int], SequentialTest] = {}
         self._pair_rules = PairRules(speed_mps=settings.pair_speed_mps, radius_m=settings.pair_radius_m)
@@ -101,7 +103,7 @@ class FusionEngine:
         rules = self._rules(info.period_s, self.settings.local_coast_periods * info.period_s)
         if old is None:
             self._system.add_sensors(len(self.sensors))
-            self._locals.append(self._layer(rules, self.settings.ring_local, 1))
+            self._locals.append(self._layer(self._local_models, rules, self.settings.ring_local))
             for other in range(sensor.index):
                 self._tests[other, sensor.index] = SequentialTest(self._pair_rules)
         else:
@@ -349,9 +351,9 @@ class FusionEngine:
         # Tentative tracks have no public number yet; theirs is of a range that confirmed ones never reach.
         return (self.unit.number << _TRACK_BITS) | (1 << (_TRACK_BITS - 1)) | self._system.life.uid[rows]
 
-    def _layer(self, rules: Rules, ring: int, sensors: int) -> Layer:
+    def _layer(self, models: Models, rules: Rules, ring: int) -> Layer:
         s = self.settings
-        return Layer(self._models, rules, ring, sensors, s.gate, s.sigma_velocity_mps)
+        return Layer(models, rules, ring, 1, s.gate, s.sigma_velocity_mps)
 
     def _rules(self, period_s: float, coast_s: float) -> Rules:
         s = self.settings

@@ -20,7 +20,10 @@ class EngineSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    filter: FilterName = Field("tvimm", description="the filter of every track")
+    filter: FilterName = Field("tvimm", description="the filter of the system tracks")
+    local_filter: FilterName = Field(
+        "imm", description="the filter of local tracks, which serve association only: a cheap one does as well"
+    )
     q_m2ps3: Annotated[list[Positive], Field(min_length=1, max_length=4)] = Field(
         [1.0, 50.0, 500.0], description="acceleration noise density of each constant-velocity model"
     )
@@ -62,23 +65,30 @@ class EngineSettings(BaseModel):
         return self
 
     def models(self) -> Models:
-        """The models of the filter."""
-        return make_models(
-            self._branches(),
-            memory_s=self.tpm_memory_s,
-            reference_s=self.tpm_reference_s,
-            printed=self.filter == "tvimm-paper",
-        )
+        """The models of the system tracks."""
+        return self._models(self.filter)
+
+    def local_models(self) -> Models:
+        """The models of the local tracks."""
+        return self._models(self.local_filter)
 
     def model_names(self) -> list[str]:
         """Names of the models in a frame."""
-        return [model.name for branch in self._branches() for model in branch.models]
+        return [model.name for branch in self._branches(self.filter) for model in branch.models]
 
-    def _branches(self) -> tuple[Branch, ...]:
-        if self.filter == "tvimm":
+    def _models(self, name: str) -> Models:
+        return make_models(
+            self._branches(name),
+            memory_s=self.tpm_memory_s,
+            reference_s=self.tpm_reference_s,
+            printed=name == "tvimm-paper",
+        )
+
+    def _branches(self, name: str) -> tuple[Branch, ...]:
+        if name == "tvimm":
             words = (self.acceleration_max_mps2, self.manoeuvre_s, self.quiet_s, self.q_quiet)
             return (manoeuvre_models(np.deg2rad(self.turn_rate_max_degps), *words), generic_models(*words))
-        prior = self.tpm_prior_count if self.filter == "tvimm-dirichlet" else np.inf
+        prior = self.tpm_prior_count if name == "tvimm-dirichlet" else np.inf
         return (velocity_models(self.q_m2ps3, self.sojourn_s, prior),)
 
 
