@@ -273,6 +273,15 @@ def test_a_prediction_is_the_jacobian_and_the_noise_of_the_own_parameter(kind: i
     np.testing.assert_allclose(P / np.outer(scale, scale), want / np.outer(scale, scale), atol=0.04)
 
 
+def test_the_noise_of_a_turn_rate_acts_across_the_way_at_half_time() -> None:
+    dt, w = 2.0, 0.2
+    _, P = run_model(TURN, [1e-12, w, 0.02, 20.0], np.array([0.0, 0.0, 120.0, 50.0, w]), np.zeros((5, 5)), dt)
+    heading = np.arctan2(50.0, 120.0) + 0.5 * w * dt
+    along = np.array([np.cos(heading), np.sin(heading)])
+    for block in (P[:2, :2], P[2:4, 2:4]):
+        assert along @ block @ along < 1e-9 * np.trace(block)
+
+
 def test_the_strongest_acceleration_of_a_model() -> None:
     w = np.deg2rad(6.0)
     numbers = np.array([[m.q, m.mean, m.sd, m.time_s] for m in MANOEUVRE.models])
