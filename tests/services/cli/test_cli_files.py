@@ -136,7 +136,8 @@ def test_into_a_pipe_there_is_no_progress_and_no_colour(
         assert b"\x1b" not in done.stdout + done.stderr
     assert (track.stdout, track.stderr.count(b"\n"), score.stderr) == (b"", 1, b"")
     assert json.loads(score.stdout)["frames"] > 0
-    assert tracks.read_bytes() == (recording / "tracks.jsonl").read_bytes()
+    same = tracks.read_bytes() == (recording / "tracks.jsonl").read_bytes()
+    assert same  # not compared by pytest: a diff of two long files takes minutes
 
 
 # --- help

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from trackmesh.services.estimation.jit import exact_kernel as kernel
+from trackmesh.services.estimation.jit import parallel_kernel as kernel
 
 __all__ = ["BoolArray", "FloatArray", "IntArray", "kernel"]
 

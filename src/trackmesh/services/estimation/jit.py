@@ -19,17 +19,18 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 _DEPENDS_ON = {"estimation": ("estimation",), "fusion": ("estimation", "fusion"), "emi": ("emi",)}
 
-# All flags but nnan and ninf: those would let the compiler drop the guards against non-finite numbers.
-_FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
-
 
 def kernel(function: F) -> F:
-    """Compile a function with numba, cached on disk and shared by all processes."""
-    return _compiled(function, fastmath=_FASTMATH)
+    """Compile a function with numba, cached on disk and shared by all processes.
+
+    No fast mathematics: with it the last bits of a result depend on what the compiler chose to inline, which is not the
+    same in a process that compiled a kernel as in one that loaded it, and equal inputs must give equal bytes.
+    """
+    return _compiled(function)
 
 
-def exact_kernel(function: F) -> F:
-    """As ``kernel``, but the arithmetic is done exactly as written, and the interpreter lock is released."""
+def parallel_kernel(function: F) -> F:
+    """As ``kernel``, and the interpreter lock is released."""
     return _compiled(function, nogil=True)
 
 
