@@ -73,11 +73,12 @@ def add_along(P: FloatArray, block: FloatArray, east: float, north: float, own: 
     for i in range(2):
         a = u0 if i == 0 else u1
         for j in range(2):
-            b = u0 if j == 0 else u1
-            P[i, j] += block[0] * a * b
-            P[i, j + 2] += block[1] * a * b
-            P[j + 2, i] += block[1] * a * b
-            P[i + 2, j + 2] += block[3] * a * b
+            # The product first: it is the same for (i, j) and (j, i), so that P stays symmetric to the last bit.
+            ab = a * (u0 if j == 0 else u1)
+            P[i, j] += block[0] * ab
+            P[i, j + 2] += block[1] * ab
+            P[j + 2, i] += block[1] * ab
+            P[i + 2, j + 2] += block[3] * ab
         P[i, own] += block[2] * a
         P[own, i] += block[2] * a
         P[i + 2, own] += block[4] * a
