@@ -269,7 +269,7 @@ def test_human_logs_say_when_in_utc_and_who(capsys: pytest.CaptureFixture[str]) 
 
 
 SERVICE = """
-import sys, threading
+import os, sys, threading
 from trackmesh.protocol.memory_bus import MemoryBus
 from trackmesh.services.runtime import ServiceRuntime, ServiceSettings
 
@@ -282,7 +282,8 @@ def start(runtime):
     if what == "broken":
         1 / 0
     runtime.set_state("ready")
-    print("ready", flush=True)
+    # One write, so that no line of another thread comes between the word and its end of line.
+    os.write(1, b"ready\\n")
 
 settings = ServiceSettings.load(overrides={"stop_deadline_s": 0.2, "log_format": "json", "connect_timeout_s": 60})
 bus = None if sys.argv[1] == "waiting" else MemoryBus()
