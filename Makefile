@@ -20,7 +20,8 @@ check: $(VENV)/ready
 
 studies: $(VENV)/ready
 	mkdir -p out/studies
-	$(BIN)/trackmesh study alpha-beta --json out/studies/alpha-beta.json --plots out/studies
+	for name in tvimm manoeuvre alpha-beta; do \
+		$(BIN)/trackmesh study $$name --json out/studies/$$name.json --plots out/studies || exit 1; done
 
 bench: $(VENV)/ready
 	$(BIN)/python -m benchmarks.run

@@ -16,7 +16,8 @@ from trackmesh.protocol.keys import Keys, kind_and_id, last_chunk, matches, pars
 
 KEYS = Keys("harbour")
 ONE_ID: list[Callable[[str], str]] = [
-    KEYS.plots, KEYS.ranges, KEYS.sensor, KEYS.tracks, KEYS.tags, KEYS.band, KEYS.registration, KEYS.truth,
+    KEYS.plots, KEYS.ranges, KEYS.sensor, KEYS.tracks, KEYS.refined, KEYS.tags, KEYS.band, KEYS.registration,
+    KEYS.truth,
 ]  # fmt: skip
 TWO_IDS: list[Callable[[str, str], str]] = [KEYS.service, KEYS.live, KEYS.status]
 
@@ -28,7 +29,7 @@ expressions = st.lists(chunks | st.sampled_from(["*", "**"]), min_size=1, max_si
 def test_the_keys_are_those_of_the_protocol() -> None:
     assert [key("x") for key in ONE_ID] == [
         f"harbour/@v1/{family}/x"
-        for family in ("plots", "ranges", "sensors", "tracks", "tags", "band", "registration", "truth")
+        for family in ("plots", "ranges", "sensors", "tracks", "refined", "tags", "band", "registration", "truth")
     ]
     assert [key("x", "y") for key in TWO_IDS] == [f"harbour/@v1/{family}/x/y" for family in ("svc", "live", "status")]
     assert Keys().plots("x") == "trackmesh/@v1/plots/x"

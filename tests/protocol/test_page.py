@@ -142,7 +142,7 @@ def test_the_page_tells_every_key() -> None:
         keys.status("x", "x"),
     }
     families |= {
-        key("x") for key in (keys.plots, keys.ranges, keys.sensor, keys.tracks, keys.tags, keys.band,
+        key("x") for key in (keys.plots, keys.ranges, keys.sensor, keys.tracks, keys.refined, keys.tags, keys.band,
                              keys.registration, keys.truth)
     }  # fmt: skip
     told = {re.sub(r"\{\w+\}", "x", cells[0].strip("`")) for cells in rows(sections()["Keys"])}

@@ -23,6 +23,7 @@ from trackmesh.protocol.messages import (
     EmiResult,
     EmiScanBatch,
     HistoryQuery,
+    RefinedFrame,
     SensorInfo,
     ServiceStatus,
     TrackFrame,
@@ -145,6 +146,10 @@ class Client:
     def watch_tracks(self, unit: str = "*", *, history: bool = True, capacity: int = 4096) -> Watch[TrackFrame]:
         """Frames as they are published; with ``history`` those lost in an outage too, and the last few before now."""
         return Watch(self.bus.subscribe(self.keys.tracks(unit), history=history, capacity=capacity), TrackFrame)
+
+    def watch_refined(self, unit: str = "*", *, capacity: int = 4096) -> Watch[RefinedFrame]:
+        """Refined states of some plots ago, of units whose ``lag`` is set."""
+        return Watch(self.bus.subscribe(self.keys.refined(unit), history=True, capacity=capacity), RefinedFrame)
 
     def watch_statuses(self, kind: str = "*", unit: str = "*") -> Watch[ServiceStatus]:
         """How services are, once a second each, the present first."""

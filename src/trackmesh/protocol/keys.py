@@ -44,6 +44,10 @@ class Keys:
         """Where a unit publishes its picture."""
         return self._key("tracks", unit_id)
 
+    def refined(self, unit_id: str) -> str:
+        """Where a unit publishes states of some plots ago, refined since."""
+        return self._key("refined", unit_id)
+
     def tags(self, unit_id: str) -> str:
         """Where a tag service publishes its picture."""
         return self._key("tags", unit_id)

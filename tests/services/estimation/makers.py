@@ -7,17 +7,21 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
+import scipy.linalg
 from hypothesis import settings
 from hypothesis import strategies as st
 
 from trackmesh.services.estimation import imm, tracks
-from trackmesh.services.estimation.bank import Models, State, Work, make_models, make_state
+from trackmesh.services.estimation.bank import Models, State, make_models, make_states, make_work
 from trackmesh.services.estimation.filters import generic_models, manoeuvre_models, velocity_models
+from trackmesh.services.estimation.gating import Mixture, make_mixture
+from trackmesh.services.estimation.plots import Plots, make_plots
 from trackmesh.services.estimation.tracks import Filters, make_filters
+from trackmesh.services.estimation.transition import transition_matrix, uniformised
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -31,9 +35,10 @@ def velocities(
     sojourn_s: tuple[float, ...] = (50.0, 15.0, 15.0),
     prior_count: float = np.inf,
     printed: bool = False,
+    lags: int = 0,
 ) -> Models:
     """One branch of constant-velocity models."""
-    return make_models((velocity_models(list(q), list(sojourn_s), prior_count),), printed=printed)
+    return make_models((velocity_models(list(q), list(sojourn_s), prior_count),), printed=printed, lags=lags)
 
 
 MODELS = velocities()
@@ -44,6 +49,9 @@ GENERIC = generic_models(10.0, 18.0, 45.0, 0.3)
 TVIMM = make_models((MANOEUVRE, GENERIC))
 NAMED = {"imm": MODELS, "tvimm-dirichlet": DIRICHLET, "tvimm-paper": PAPER, "tvimm": TVIMM}
 """Every named filter."""
+
+LAGGED, TVIMM_LAGGED = velocities(lags=2), make_models((MANOEUVRE, GENERIC), lags=2)
+"""Filters that keep two lags."""
 
 SCALE = np.outer([100.0, 100.0, 10.0, 10.0], [100.0, 100.0, 10.0, 10.0])
 """Turns a random covariance into one of metres and metres a second."""
@@ -87,20 +95,20 @@ def probabilities(rng: np.random.Generator, r: int) -> FloatArray:
 
 
 def random_state(rng: np.random.Generator, models: Models) -> State:
-    """A filter in the middle of its life, its models a few hundred metres apart; one row at time 0."""
-    s = make_state(models, 1)
-    r, d = s.x.shape[1:]
+    """A filter in the middle of its life, its models a few hundred metres apart, at time 0."""
+    s: State = make_states(models, 1)[0]
+    r, d = s.x.shape
     unit = np.array([100.0, 100.0, 10.0, 10.0, 0.03, 0.03])[:d]
     for j in range(r):
         n = models.states[j]
         own = models.numbers[j, 1] * (np.arange(n) >= 4)
-        s.x[0, j, :n] = rng.normal(size=n) * 3.0 * unit[:n] + own
-        s.P[0, j, :n, :n] = covariance(rng, n) * np.outer(unit[:n], unit[:n])
-        s.age_s[0, j] = rng.uniform(0.0, 30.0)
+        s.x[j, :n] = rng.normal(size=n) * 3.0 * unit[:n] + own
+        s.P[j, :n, :n] = covariance(rng, n) * np.outer(unit[:n], unit[:n])
+        s.age_s[j] = rng.uniform(0.0, 30.0)
     for b in range(len(models.split_s)):
         low, high = models.first[b], models.first[b + 1]
-        s.mu[0, low:high] = probabilities(rng, high - low)
-    s.weight[0] = probabilities(rng, len(models.split_s))
+        s.mu[low:high] = probabilities(rng, high - low)
+    s.weight[:] = probabilities(rng, len(models.split_s))
     return s
 
 
@@ -130,10 +138,12 @@ H = np.eye(2, 4)
 
 
 def mixture_moments(x: FloatArray, P: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance of a Gaussian mixture, by the definition."""
-    mean = weight @ x
-    second = sum(w * (p + np.outer(m, m)) for w, m, p in zip(weight, x, P, strict=True))
-    return mean, np.asarray(second - np.outer(mean, mean))
+    """Mean and covariance of a Gaussian mixture: the second moment less the square of the first."""
+    # Moments about the first component: about the origin, positions of 1e4 m would cost eight digits.
+    off = x - x[0]
+    mean = weight @ off
+    second = sum(w * (p + np.outer(m, m)) for w, m, p in zip(weight, off, P, strict=True))
+    return x[0] + mean, np.asarray(second - np.outer(mean, mean))
 
 
 def dense_update(x: FloatArray, P: FloatArray, plot: Plot) -> tuple[FloatArray, FloatArray, float]:
@@ -147,60 +157,115 @@ def dense_update(x: FloatArray, P: FloatArray, plot: Plot) -> tuple[FloatArray, 
     return x + K @ nu, left @ P @ left.T + K @ unpacked(plot.R) @ K.T, float(log_likelihood)
 
 
-def work(models: Models) -> Work:
-    return imm.make_work(models, int(models.states.max()))
+def batch(*plots: Plot) -> Plots:
+    """Plots as the kernels take them."""
+    return make_plots(np.array([p.z for p in plots]), np.array([p.R for p in plots]), np.array([p.t_s for p in plots]))
 
 
 def begun(models: Models, plot: Plot, sigma_v_mps: float = 150.0) -> State:
-    """One row, begun with a plot."""
-    s = make_state(models, 1)
-    imm.begin(models, s, 0, plot.z, plot.R, plot.t_s, sigma_v_mps)
+    """A filter, begun with a plot."""
+    s: State = make_states(models, 1)[0]
+    imm.begin(models, s, batch(plot)[0], sigma_v_mps)
     return s
 
 
-def copied_state(s: State) -> State:
-    return State(*(a.copy() for a in s))
+def copied_state(s: Any) -> State:
+    return cast("State", np.array([s], s.dtype)[0])
+
+
+def fields(s: Any) -> dict[str, FloatArray]:
+    """All that a state holds, by name."""
+    return {name: np.asarray(s[name]) for name in s.dtype.names}
 
 
 def filtered(models: Models, s: State, plots: list[Plot]) -> State:
-    """A copy of row 0, fed with plots in order by the kernel of one track."""
-    out, w = State(*(a[:1].copy() for a in s)), work(models)
+    """A copy, fed with plots in order by the kernel of one track."""
+    out, w = copied_state(s), make_work(models)
     for plot in plots:
-        imm.filter_plot(models, out, 0, plot.z, plot.R, plot.t_s, w)
+        imm.filter_plot(models, out, batch(plot)[0], w)
     return out
 
 
 def interacted(models: Models, s: State, t_s: float) -> State:
-    """A copy of row 0, predicted to a time."""
-    out = State(*(a[:1].copy() for a in s))
-    imm.interact(models, out, 0, t_s, work(models))
+    """A copy, predicted to a time."""
+    out = copied_state(s)
+    imm.interact(models, out, t_s, make_work(models))
     return out
 
 
-def output(models: Models, s: State) -> tuple[FloatArray, FloatArray]:
-    """Estimate (4,) and covariance (4, 4) of row 0."""
+def updated(models: Models, s: State, plot: Plot, dt_s: float) -> State:
+    """A copy, updated with a plot."""
+    out = copied_state(s)
+    imm.update(models, out, batch(plot)[0], dt_s, make_work(models))
+    return out
+
+
+def step_matrix(models: Models, s: State, dt_s: float, branch: int = 0) -> FloatArray:
+    """The transition matrix of a step of one branch."""
+    w = make_work(models)
+    imm.step_matrix(models, s, branch, dt_s, w)
+    low, high = models.first[branch], models.first[branch + 1]
+    return np.array(w.pi[low:high, : high - low])
+
+
+def chain(G: FloatArray, dt_s: float) -> FloatArray:
+    """The transition matrix of a generator, by the kernel."""
+    r = len(G)
+    out = np.empty((r, r))
+    transition_matrix(*uniformised(G, r), dt_s, out, np.empty((3, r, r)))
+    return out
+
+
+def chain_matrix(models: Models, dt_s: float, branch: int = 0) -> FloatArray:
+    """The fixed transition matrix of a branch, by scipy's matrix exponential."""
+    n = int(models.first[branch + 1] - models.first[branch])
+    G = models.rate[branch] * (models.jump[branch, :n, :n] - np.eye(n))
+    return np.asarray(scipy.linalg.expm(G * dt_s))
+
+
+def mixture(models: Models, s: State) -> Mixture:
+    """Position and velocity, model by model, as one mixture."""
     mu = np.empty((1, len(models.kind)))
-    imm.probabilities(models, s, 0, mu[0])
-    mean, P = tracks.estimates(models, s.x[:1], s.P[:1], mu)
+    imm.probabilities(models, s, mu[0])
+    return Mixture(np.array(s.x[None, :, :4]), np.array(s.P[None, :, :4, :4]), mu)
+
+
+def output(models: Models, s: State) -> tuple[FloatArray, FloatArray]:
+    """Estimate (4,) and covariance (4, 4)."""
+    mean, P = tracks.estimates(models, mixture(models, s))
     return mean[0], P[0]
 
 
-def assert_sound(models: Models, s: State, row: int = 0, slack: float = 1e-12) -> None:
+def assert_sound(models: Models, s: Any, slack: float = 1e-12) -> None:
     """Finite, symmetric, positive semi-definite (to ``slack`` of the scale of each), probabilities that sum to one."""
-    for a in s:
-        assert np.isfinite(a[row]).all()
+    for name in s.dtype.names:
+        assert np.isfinite(s[name]).all(), name
     for j, d in enumerate(models.states.tolist()):
-        P = s.P[row, j, :d, :d]
-        assert np.array_equal(P, P.T)
-        # Metres, metres a second and rad/s: compare what has been brought to one scale.
-        scale = np.sqrt(np.maximum(np.diag(P), 1e-300))
-        assert np.all(np.diag(P) >= 0)
-        least, *_, most = np.linalg.eigvalsh(P / np.outer(scale, scale))
-        assert least >= -slack * most
+        assert_covariance(s.P[j, :d, :d], slack)
+        for lag in range(len(s.y_t_s)):
+            assert_covariance(s.Y[lag, j], slack)
     for low, high in zip(models.first, models.first[1:], strict=False):
-        assert abs(s.mu[row, low:high].sum() - 1.0) < 1e-9
-        assert s.mu[row, low:high].min() >= 0
-    assert abs(s.weight[row].sum() - 1.0) < 1e-9
+        assert abs(s.mu[low:high].sum() - 1.0) < 1e-9
+        assert s.mu[low:high].min() >= 0
+    assert abs(s.weight.sum() - 1.0) < 1e-9
+
+
+def assert_covariance(P: FloatArray, slack: float = 1e-12) -> None:
+    """Symmetric and, to ``slack`` of its scale, positive semi-definite."""
+    assert np.array_equal(P, P.T)
+    # Metres, metres a second and rad/s: compare what has been brought to one scale.
+    scale = np.sqrt(np.maximum(np.diag(P), 1e-300))
+    assert np.all(np.diag(P) >= 0)
+    least, *_, most = np.linalg.eigvalsh(P / np.outer(scale, scale))
+    assert least >= -slack * most
+
+
+def assert_scaled(x: FloatArray, P: FloatArray, want_x: FloatArray, want_P: FloatArray, tolerance: float) -> None:
+    """Equal to ``tolerance`` standard deviations of what is wanted."""
+    scale = np.sqrt(np.diag(want_P))
+    np.testing.assert_allclose(x / scale, want_x / scale, rtol=tolerance, atol=tolerance)
+    unit = np.outer(scale, scale)
+    np.testing.assert_allclose(P / unit, want_P / unit, rtol=0, atol=tolerance)
 
 
 def fresh_filters(models: Models, first: Plot, rows: int = 1, ring: int = 6) -> Filters:
@@ -211,31 +276,33 @@ def fresh_filters(models: Models, first: Plot, rows: int = 1, ring: int = 6) -> 
 
 
 def begin_row(models: Models, f: Filters, row: int, plot: Plot, sigma_v_mps: float = 150.0) -> None:
-    tracks.begin(models, f, np.array([row]), plot.z[None], plot.R[None], np.array([plot.t_s]), sigma_v_mps)
+    tracks.begin(models, f, np.array([row]), batch(plot), sigma_v_mps)
 
 
-def feed_row(models: Models, f: Filters, row: int, plot: Plot, sensor: int = 0) -> bool:
-    taken = tracks.feed(models, f, np.array([row]), plot.z[None], plot.R[None], np.array([plot.t_s]), sensor)
-    return bool(taken[0])
+def feed_row(models: Models, f: Filters, row: int, plot: Plot) -> bool:
+    return bool(tracks.feed(models, f, np.array([row]), batch(plot))[0])
 
 
 def copied(f: Filters) -> Filters:
-    rest = {name: getattr(f, name).copy() for name in Filters._fields[2:]}
-    return Filters(copied_state(f.head), copied_state(f.lag), **rest)
+    return f._replace(**{name: getattr(f, name).copy() for name in Filters._fields[:7]})
 
 
-def head(f: Filters, row: int = 0) -> State:
-    """The head of a row, as one row."""
-    return State(*(a[row : row + 1].copy() for a in f.head))
+def meaning(f: Filters, row: int) -> list[bytes]:
+    """All that a row holds; of the ring only the plots in use."""
+    rest = (f.head, f.base, f.ring_n, f.t_s, f.mean, f.spread)
+    return [f.ring[row, : f.ring_n[row]].tobytes(), *(a[row].tobytes() for a in rest)]
 
 
-def predicted(
-    models: Models, f: Filters, rows: IntArray, t_s: FloatArray
-) -> tuple[State, FloatArray, npt.NDArray[np.bool_]]:
-    """Predictions of rows, the probabilities of all models, and which are known."""
-    out, mu = make_state(models, len(rows)), np.zeros((len(rows), len(models.kind)))
-    known = tracks.predict(models, f, rows, t_s, out, mu)
-    return out, mu, known
+def same(one: Filters, other: Filters, row: int = 0, other_row: int | None = None) -> bool:
+    """Whether two rows are equal bit for bit."""
+    return meaning(one, row) == meaning(other, row if other_row is None else other_row)
+
+
+def predicted(models: Models, f: Filters, rows: IntArray, t_s: FloatArray) -> tuple[Mixture, npt.NDArray[np.bool_]]:
+    """Predictions of rows, and which are known."""
+    out = make_mixture(len(rows), len(models.kind))
+    known = tracks.predict(models, f, rows, t_s, out)
+    return out, known
 
 
 def plain_python(expression: str, module: str) -> Any:
@@ -252,11 +319,12 @@ def plain_python(expression: str, module: str) -> Any:
 
 
 def fed_walk(models: Models) -> FloatArray:
-    """Mean, covariance and model probabilities of one track after a walk with a late plot, as one row of numbers."""
+    """Mean, covariance, model probabilities and past of one track after a walk with a late plot, in one row."""
     plots = random_walk(np.random.default_rng(11), 20)
     f = fresh_filters(models, plots[0])
     for plot in [*plots[1:10], *plots[11:14], plots[10], *plots[14:]]:
         feed_row(models, f, 0, plot)
-    ahead, mu, _ = predicted(models, f, np.array([0]), f.head.t_s + 3.0)
-    mean, P = tracks.estimates(models, ahead.x, ahead.P, mu)
-    return np.concatenate([mean.ravel(), P.ravel(), mu.ravel()])
+    ahead, _ = predicted(models, f, np.array([0]), f.t_s + 3.0)
+    mean, P = tracks.estimates(models, ahead)
+    past = f.head[0]
+    return np.concatenate([part.ravel() for part in (mean, P, ahead.mu, past.y, past.Y)])

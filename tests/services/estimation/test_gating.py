@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 import scipy.special
@@ -15,9 +17,16 @@ from tests.services.estimation.makers import (
     unpacked,
 )
 
-from trackmesh.services.estimation.gating import gate, mixture_cost
+from trackmesh.services.estimation.gating import Mixture, gate, mixture_cost
+from trackmesh.services.estimation.plots import Plots, make_plots
 
-Scene = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+
+class Scene(NamedTuple):
+    """Tracks, their times, plots."""
+
+    tracks: Mixture
+    t_s: FloatArray
+    plots: Plots
 
 
 def scene(rng: np.random.Generator, n: int, m: int, r: int, span_m: float = 2000.0) -> Scene:
@@ -27,17 +36,18 @@ def scene(rng: np.random.Generator, n: int, m: int, r: int, span_m: float = 2000
     P = covariances(rng, (n, r), 4, 900.0)
     mu = rng.dirichlet(np.ones(r), n)
     z = rng.uniform(-200, span_m + 200, (m, 2))
-    return x, P, mu, rng.uniform(-1.5, 1.5, n), z, packed(covariances(rng, (m,), 2, 900.0)), rng.uniform(-1.5, 1.5, m)
+    t_s, R = rng.uniform(-1.5, 1.5, n), packed(covariances(rng, (m,), 2, 900.0))
+    return Scene(Mixture(x, P, mu), t_s, make_plots(z, R, rng.uniform(-1.5, 1.5, m)))
 
 
 def brute_force(things: Scene, limit: float) -> dict[tuple[int, int], float]:
     """Every pair inside a model's ellipse, with -2 ln of the mixture density but for its constant."""
-    x, P, mu, t, z, R, tz = things
+    x, P, mu = things.tracks
     found = {}
     for i in range(len(x)):
-        for j in range(len(z)):
-            nu = z[j] - x[i, :, :2] - (tz[j] - t[i]) * x[i, :, 2:]
-            S = P[i, :, :2, :2] + unpacked(R[j])
+        for j, plot in enumerate(things.plots):
+            nu = plot["z"] - x[i, :, :2] - (plot["t_s"] - things.t_s[i]) * x[i, :, 2:]
+            S = P[i, :, :2, :2] + unpacked(plot["R"])
             distance = np.einsum("ra,ra->r", nu, np.linalg.solve(S, nu[..., None])[..., 0])
             if (distance <= limit).any():
                 log_weight = np.log(mu[i]) - 0.5 * (distance + np.linalg.slogdet(S)[1])
@@ -68,17 +78,18 @@ def test_more_pairs_than_room_was_made_for() -> None:
 def test_pairs_come_in_order_of_track_then_north() -> None:
     things = scene(np.random.default_rng(2), 20, 30, 2, span_m=300.0)
     i, j, _ = gate(*things, 25.0)
-    north = things[4][:, 1]
+    north = things.plots["z"][:, 1]
     keys: list[tuple[int, float]] = [(int(a), float(north[b])) for a, b in zip(i, j, strict=True)]
     assert len(keys) > 30
     assert keys == sorted(keys)
 
 
 def test_the_cost_of_one_model_is_the_normal_density() -> None:
-    x, P, mu, _, z, R, _ = scene(np.random.default_rng(3), 1, 1, 1, span_m=10.0)
-    cost = mixture_cost(x[0], P[0], mu[0], z[0], R[0], 0.0, 1e9)
-    density = scipy.stats.multivariate_normal(x[0, 0, :2], P[0, 0, :2, :2] + unpacked(R[0]))
-    assert -0.5 * cost - np.log(2 * np.pi) == pytest.approx(density.logpdf(z[0]), abs=1e-9)
+    (x, P, mu), _, plots = scene(np.random.default_rng(3), 1, 1, 1, span_m=10.0)
+    z, R = plots[0]["z"], plots[0]["R"]
+    cost = mixture_cost(x[0], P[0], mu[0], z, R, 0.0, 1e9)
+    density = scipy.stats.multivariate_normal(x[0, 0, :2], P[0, 0, :2, :2] + unpacked(R))
+    assert -0.5 * cost - np.log(2 * np.pi) == pytest.approx(density.logpdf(z), abs=1e-9)
 
 
 def test_a_plot_in_the_wide_model_alone_is_inside() -> None:
@@ -98,6 +109,6 @@ def test_a_covariance_that_is_not_positive_is_in_no_gate() -> None:
 @pytest.mark.parametrize(("n", "m"), [(0, 3), (3, 0), (0, 0)])
 def test_nothing_on_one_side_gives_no_pairs(n: int, m: int) -> None:
     rng = np.random.default_rng(4)
-    x, P, mu, t, z, R, tz = scene(rng, 3, 3, 2)
-    i, j, cost = gate(x[:n], P[:n], mu[:n], t[:n], z[:m], R[:m], tz[:m], 16.0)
+    tracks, t_s, plots = scene(rng, 3, 3, 2)
+    i, j, cost = gate(Mixture(*(part[:n] for part in tracks)), t_s[:n], plots[:m], 16.0)
     assert i.tolist() == j.tolist() == cost.tolist() == []

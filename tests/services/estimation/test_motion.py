@@ -8,7 +8,7 @@ import pytest
 import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.services.estimation.makers import LAW, MANOEUVRE, FloatArray, covariance, flow, noise, seeds
+from tests.services.estimation.makers import LAW, FloatArray, covariance, flow, noise, seeds
 
 from trackmesh.services.estimation.motion import (
     CONSTANT_ACCELERATION,
@@ -19,7 +19,7 @@ from trackmesh.services.estimation.motion import (
     TANGENTIAL,
     TURN,
     acceleration_matrix,
-    own_acceleration,
+    linear_flow,
     predict_constant_velocity,
     predict_model,
     tangential,
@@ -183,7 +183,7 @@ def run_model(
     kind: int, numbers: list[float], x: FloatArray, P: FloatArray, dt_s: float
 ) -> tuple[FloatArray, FloatArray]:
     x, P = x.copy(), P.copy()
-    predict_model(kind, np.array(numbers), x, P, dt_s, np.empty((13, 6)))
+    predict_model(kind, np.array(numbers), x, P, dt_s, np.empty((6, 6)), np.empty((6, 6)), np.empty(6))
     return x, P
 
 
@@ -282,8 +282,20 @@ def test_the_noise_of_a_turn_rate_acts_across_the_way_at_half_time() -> None:
         assert along @ block @ along < 1e-9 * np.trace(block)
 
 
-def test_the_strongest_acceleration_of_a_model() -> None:
-    w = np.deg2rad(6.0)
-    numbers = np.array([[m.q, m.mean, m.sd, m.time_s] for m in MANOEUVRE.models])
-    got = [own_acceleration(m.kind, n, 100.0) for m, n in zip(MANOEUVRE.models, numbers, strict=True)]
-    np.testing.assert_allclose(got, [0.0, 101.0 * w, 101.0 * w, 12.0, 20.0], rtol=1e-12)
+@pytest.mark.parametrize("kind", range(6))
+@LAW
+@given(seed=seeds, dt=st.floats(0.01, 10.0))
+def test_the_flow_that_is_left_behind_is_the_jacobian(kind: int, seed: int, dt: float) -> None:
+    """Of whatever model: what the lags are carried by. Differences know it to 1e-6 of each column."""
+    d = STATES[kind]
+    (x, P), F, numbers = longer_start(seed, d), np.full((6, 6), np.nan), np.array([1.0, 0.05, 0.02, 10.0])
+
+    def predicted_mean(y: FloatArray) -> FloatArray:
+        out = y.copy()
+        predict_model(kind, numbers, out, P.copy(), dt, F, np.empty((6, 6)), np.empty(6))
+        return out
+
+    want = jacobian(predicted_mean, x, np.array([1.0, 1.0, 0.2, 0.2, 1e-3 / dt, 1e-3 / dt])[:d])
+    predicted_mean(x)
+    linear_flow(kind, dt, F)
+    assert np.all(abs(F[:d, :d] - want) <= 1e-6 * abs(want).max(axis=0))

@@ -80,14 +80,14 @@ def test_the_more_confident_model_wins_whatever_the_plot(seed: int) -> None:
     """ln(mu_1/mu_2) = D^T (P_1^-1 - P_2^-1) D / 2 with D = x_1 - x_2; no plot is in it."""
     rng = np.random.default_rng(seed)
     s = random_state(rng, TWO)
-    s.x[0], s.P[0] = rng.normal(size=(2, 4)), covariances(rng, (2,), 4)
-    printed.after_update(TWO, s, 0)
-    inverse, D = np.linalg.inv(s.P[0]), s.x[0, 0] - s.x[0, 1]
+    s.x[:], s.P[:] = rng.normal(size=(2, 4)), covariances(rng, (2,), 4)
+    printed.after_update(TWO, s)
+    inverse, D = np.linalg.inv(s.P), s.x[0] - s.x[1]
     want = 0.5 * D @ (inverse[0] - inverse[1]) @ D
     bound = -np.log(printed.LEAST_PROBABILITY)
     if abs(want) < 0.9 * bound:
-        assert np.log(s.mu[0, 0] / s.mu[0, 1]) == pytest.approx(want, rel=1e-4, abs=1e-4)
-    assert s.mu[0].sum() == pytest.approx(1.0, abs=1e-12)
+        assert np.log(s.mu[0] / s.mu[1]) == pytest.approx(want, rel=1e-4, abs=1e-4)
+    assert s.mu.sum() == pytest.approx(1.0, abs=1e-12)
 
 
 @LAW
@@ -95,18 +95,18 @@ def test_the_more_confident_model_wins_whatever_the_plot(seed: int) -> None:
 def test_the_next_matrix_is_that_of_densities_of_states(seed: int) -> None:
     rng = np.random.default_rng(seed)
     s = random_state(rng, PAPER)
-    s.x[0], s.P[0] = rng.normal(size=(3, 4)), covariances(rng, (3,), 4)
-    printed.after_update(PAPER, s, 0)
+    s.x[:], s.P[:] = rng.normal(size=(3, 4)), covariances(rng, (3,), 4)
+    printed.after_update(PAPER, s)
     density = np.array(
-        [[scipy.stats.multivariate_normal(s.x[0, b], s.P[0, b]).pdf(s.x[0, a]) for b in range(3)] for a in range(3)]
+        [[scipy.stats.multivariate_normal(s.x[b], s.P[b]).pdf(s.x[a]) for b in range(3)] for a in range(3)]
     )
-    np.testing.assert_allclose(s.counts[0], density / density.sum(axis=1, keepdims=True), atol=1e-4)
+    np.testing.assert_allclose(s.counts, density / density.sum(axis=1, keepdims=True), atol=1e-4)
 
 
 def test_its_output_is_the_product() -> None:
     plots = random_walk(np.random.default_rng(1), 20)
     s = filtered(PAPER, begun(PAPER, plots[0]), plots[1:])
-    for got, want in zip(output(PAPER, s), product(s.x[0], s.P[0]), strict=True):
+    for got, want in zip(output(PAPER, s), product(s.x, s.P), strict=True):
         assert np.array_equal(got, want)
 
 
@@ -123,9 +123,7 @@ def test_the_product_counts_shared_plots_once_a_model() -> None:
             truth = flow(dt) @ truth + root @ rng.normal(size=4)
             plot = Plot(truth[:2] + rng.normal(0.0, sigma, 2), np.array([sigma**2, 0.0, sigma**2]), dt * k)
             s = filtered(models, s, [plot])
-            for kept, (x, P) in zip(
-                nees, (product(s.x[0], s.P[0]), mixture_moments(s.x[0], s.P[0], s.mu[0])), strict=True
-            ):
+            for kept, (x, P) in zip(nees, (product(s.x, s.P), mixture_moments(s.x, s.P, s.mu)), strict=True):
                 kept.append(float((x - truth) @ np.linalg.solve(P, x - truth)) / 4.0)
     assert np.mean(nees[0]) == pytest.approx(r, rel=0.1)
     assert np.mean(nees[1]) == pytest.approx(1.0, rel=0.1)
@@ -134,9 +132,9 @@ def test_the_product_counts_shared_plots_once_a_model() -> None:
 def test_a_model_that_nothing_comes_to_keeps_a_place() -> None:
     """States so far apart that every density under another model is nought."""
     s = random_state(np.random.default_rng(3), PAPER)
-    s.x[0, :, 0] = [1e5, 2e5, 3e5]
-    printed.after_update(PAPER, s, 0)
-    assert 0.0 < s.mu[0].min() < 1e-9
+    s.x[:, 0] = [1e5, 2e5, 3e5]
+    printed.after_update(PAPER, s)
+    assert 0.0 < s.mu.min() < 1e-9
     ahead = interacted(PAPER, s, 4.0)
-    assert np.all(ahead.x[0, :, 0] > 0.9e5), "none has fallen to the origin"
-    assert np.all(np.linalg.eigvalsh(ahead.P[0]) > 0)
+    assert np.all(ahead.x[:, 0] > 0.9e5), "none has fallen to the origin"
+    assert np.all(np.linalg.eigvalsh(ahead.P) > 0)

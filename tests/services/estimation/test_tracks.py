@@ -11,25 +11,31 @@ from tests.services.estimation.makers import (
     NAMED,
     TVIMM,
     FloatArray,
+    IntArray,
     Plot,
+    batch,
     begin_row,
     copied,
     covariances,
     feed_row,
+    fields,
     filtered,
     fresh_filters,
-    head,
     interacted,
+    mixture,
     mixture_moments,
     packed,
     predicted,
     random_walk,
+    same,
     seeds,
 )
 
 from trackmesh.services.estimation import gating, tracks
 from trackmesh.services.estimation.bank import Models
-from trackmesh.services.estimation.tracks import Filters, join_rows, make_filters
+from trackmesh.services.estimation.gating import Mixture
+from trackmesh.services.estimation.plots import Plots, make_plots
+from trackmesh.services.estimation.tracks import Filters, ImmTracks, join_rows, make_filters
 
 RING = 6
 ROW = np.array([0])
@@ -40,18 +46,6 @@ def fed(models: Models, plots: list[Plot], ring: int = RING) -> Filters:
     for plot in plots[1:]:
         assert feed_row(models, f, 0, plot)
     return f
-
-
-def meaning(f: Filters, row: int) -> list[FloatArray]:
-    """All that a row holds; of the ring only the entries in use."""
-    n = f.ring_n[row]
-    rings = [a[row][:n] for a in (f.ring_z, f.ring_R, f.ring_t_s, f.ring_sensor)]
-    return [a[row] for a in (*f.head, *f.lag, f.ring_n, f.mean, f.spread)] + rings
-
-
-def same(one: Filters, other: Filters, row: int = 0) -> bool:
-    """Equal bit for bit."""
-    return all(np.array_equal(a, b) for a, b in zip(meaning(one, row), meaning(other, row), strict=True))
 
 
 def late_order(rng: np.random.Generator, n: int, reach: int) -> list[int]:
@@ -86,49 +80,49 @@ def test_any_order_within_the_ring_is_the_order_of_time(models: Models, seed: in
 def test_the_head_is_what_the_filter_of_one_track_gives(models: Models, seed: int) -> None:
     plots = random_walk(np.random.default_rng(seed), 15)
     f = fed(models, plots)
-    begun = head(fresh_filters(models, plots[0]))
-    for got, want in zip(head(f), filtered(models, begun, plots[1:]), strict=True):
-        np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-9)
+    begun = fresh_filters(models, plots[0]).head[0]
+    got, want = fields(f.head[0]), fields(filtered(models, begun, plots[1:]))
+    for name, value in want.items():
+        np.testing.assert_allclose(got[name], value, rtol=1e-9, atol=1e-9, err_msg=name)
 
 
-def test_the_lagged_state_is_the_head_without_the_ring() -> None:
+def test_the_base_is_the_head_without_the_ring() -> None:
     plots = random_walk(np.random.default_rng(1), 20)
     f, short = fed(DIRICHLET, plots), fed(DIRICHLET, plots[:-RING])
     assert f.ring_n[0] == RING
-    assert f.lag.t_s[0] == plots[-RING - 1].t_s
-    np.testing.assert_allclose(f.lag.x[0], short.head.x[0], rtol=1e-12)
-    np.testing.assert_allclose(f.lag.counts[0], short.head.counts[0], rtol=1e-12)
+    assert f.base[0].t_s == plots[-RING - 1].t_s
+    assert f.base[0].tobytes() == short.head[0].tobytes()
 
 
-def test_a_plot_older_than_the_lagged_state_is_refused_and_changes_nothing() -> None:
+def test_a_plot_older_than_the_base_is_refused_and_changes_nothing() -> None:
     plots = random_walk(np.random.default_rng(2), 15)
     f = fed(MODELS, plots)
     before = copied(f)
-    assert not feed_row(MODELS, f, 0, plots[3]._replace(t_s=float(f.lag.t_s[0]) - 1e-6))
+    assert not feed_row(MODELS, f, 0, plots[3]._replace(t_s=float(f.base[0].t_s) - 1e-6))
     assert same(f, before)
-    assert feed_row(MODELS, f, 0, plots[3]._replace(t_s=float(f.lag.t_s[0])))
+    assert feed_row(MODELS, f, 0, plots[3]._replace(t_s=float(f.base[0].t_s)))
 
 
 def test_a_plot_of_the_same_time_comes_after_those_that_are_there() -> None:
     plots = random_walk(np.random.default_rng(3), 5)
     twin = plots[2]._replace(z=plots[2].z + 10.0)
     f = fed(MODELS, [*plots, twin])
-    assert f.ring_t_s[0, :5].tolist() == [plots[k].t_s for k in (1, 2, 2, 3, 4)]
-    assert f.ring_z[0, 2].tolist() == twin.z.tolist()
+    assert f.ring["t_s"][0, :5].tolist() == [plots[k].t_s for k in (1, 2, 2, 3, 4)]
+    assert f.ring["z"][0, 2].tolist() == twin.z.tolist()
     in_order = fed(MODELS, [*plots[:3], twin, *plots[3:]])
     assert same(f, in_order)
 
 
-def test_a_late_plot_into_a_full_ring_moves_straight_into_the_lagged_state() -> None:
+def test_a_late_plot_into_a_full_ring_moves_straight_into_the_base() -> None:
     plots = random_walk(np.random.default_rng(4), 12)
     hidden = plots[5]
     f = fed(DIRICHLET, plots[:5] + plots[6:])
     assert f.ring_n[0] == RING
-    assert f.lag.t_s[0] < hidden.t_s < f.ring_t_s[0, 0]
+    assert f.base[0].t_s < hidden.t_s < f.ring[0, 0].t_s
     assert feed_row(DIRICHLET, f, 0, hidden)
     assert f.ring_n[0] == RING
-    assert f.lag.t_s[0] == hidden.t_s
-    np.testing.assert_allclose(f.head.x[0], fed(DIRICHLET, plots).head.x[0], rtol=1e-12, atol=1e-9)
+    assert f.base[0].t_s == hidden.t_s
+    assert f.head[0].tobytes() == fed(DIRICHLET, plots).head[0].tobytes()
 
 
 def test_rows_keep_to_themselves() -> None:
@@ -138,12 +132,13 @@ def test_rows_keep_to_themselves() -> None:
     begin_row(MODELS, f, 0, one[0])
     begin_row(MODELS, f, 2, other[0])
     for a, b in zip(one[1:], other[1:], strict=True):
-        z, R, t = np.stack([b.z, a.z]), np.stack([b.R, a.R]), np.array([b.t_s, a.t_s])
-        assert tracks.feed(MODELS, f, np.array([2, 0]), z, R, t, 7).all()
+        both = batch(b, a)
+        both["sensor"] = 7
+        assert tracks.feed(MODELS, f, np.array([2, 0]), both).all()
     for row, plots in ((0, one), (2, other)):
-        np.testing.assert_array_equal(f.head.x[row], fed(MODELS, plots).head.x[0])
-    assert not f.head.x[1].any()
-    assert set(f.ring_sensor[[0, 2]].ravel().tolist()) == {7}
+        assert f.head[row].tobytes() == fed(MODELS, plots).head[0].tobytes()
+    assert not f.head["x"][1].any()
+    assert set(f.ring["sensor"][[0, 2]].ravel().tolist()) == {7}
 
 
 def test_a_row_used_again_remembers_nothing() -> None:
@@ -159,23 +154,20 @@ def test_a_row_used_again_remembers_nothing() -> None:
 def test_the_ring_of_one_track_feeds_another() -> None:
     """Two tracks that shared the plots of one target become what one track of all plots is."""
     plots = random_walk(np.random.default_rng(7), 7)
-    f = fresh_filters(MODELS, plots[0], rows=2, ring=RING)
-    begin_row(MODELS, f, 1, plots[1])
-    for k in (2, 4, 6):
-        feed_row(MODELS, f, 0, plots[k])
-    for k in (3, 5):
-        feed_row(MODELS, f, 1, plots[k])
-    tracks.feed_ring(MODELS, f, 1, 0)
-    want = fed(MODELS, [plots[0], *plots[2:]])
-    assert same(f, want)
+    layer = ImmTracks(MODELS, 2, RING, 150.0)
+    layer.begin(np.array([0, 1]), batch(*plots[:2]))
+    for row, k in ((0, 2), (0, 4), (0, 6), (1, 3), (1, 5)):
+        assert layer.feed(np.array([row]), batch(plots[k])).all()
+    layer.feed_from(1, 0)
+    assert same(layer.filters, fed(MODELS, [plots[0], *plots[2:]]))
 
 
 def test_joined_rows_are_the_rows_of_both() -> None:
     plots = random_walk(np.random.default_rng(12), 10)
     one, other = fed(TVIMM, plots), fed(TVIMM, plots[3:])
     whole = join_rows(one, other)
-    assert same(whole, one, 0)
-    assert all(np.array_equal(a, b) for a, b in zip(meaning(whole, 1), meaning(other, 0), strict=True))
+    assert same(whole, one)
+    assert same(whole, other, 1, 0)
 
 
 # --- prediction ---
@@ -187,14 +179,14 @@ def test_joined_rows_are_the_rows_of_both() -> None:
 def test_prediction_is_one_interaction_and_changes_nothing(models: Models, seed: int, dt: float) -> None:
     f = fed(models, random_walk(np.random.default_rng(seed), 10))
     before = copied(f)
-    t = f.head.t_s + dt
-    got, mu, known = predicted(models, f, ROW, t)
-    want = interacted(models, head(f), float(t[0]))
+    t = f.t_s + dt
+    got, known = predicted(models, f, ROW, t)
+    want = interacted(models, f.head[0], float(t[0]))
     assert known.all()
-    for a, b in zip(got, want, strict=True):
+    for a, b in zip(got, mixture(models, want), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
     branch = np.repeat(np.arange(len(models.split_s)), np.diff(models.first))
-    np.testing.assert_allclose(mu[0], want.mu[0] * want.weight[0, branch], rtol=1e-12)
+    np.testing.assert_allclose(got.mu[0], want.mu * want.weight[branch], rtol=1e-12)
     assert same(f, before)
 
 
@@ -206,16 +198,18 @@ def test_the_past_is_what_filtering_up_to_then_gave(models: Models, seed: int, b
     f = fed(models, plots)
     upto = len(plots) - 2 - back
     t = plots[upto].t_s + share * (plots[upto + 1].t_s - plots[upto].t_s)
-    now, now_mu, known = predicted(models, f, ROW, np.array([t]))
-    then, then_mu, _ = predicted(models, fed(models, plots[: upto + 1]), ROW, np.array([t]))
+    before = copied(f)
+    now, known = predicted(models, f, ROW, np.array([t]))
+    then, _ = predicted(models, fed(models, plots[: upto + 1]), ROW, np.array([t]))
     assert known.all()
-    for a, b in zip((*now, now_mu), (*then, then_mu), strict=True):
+    assert same(f, before)
+    for a, b in zip(now, then, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-9)
 
 
-def test_before_the_lagged_state_there_is_no_answer() -> None:
+def test_before_the_base_there_is_no_answer() -> None:
     f = fed(MODELS, random_walk(np.random.default_rng(8), 15))
-    _, _, known = predicted(MODELS, f, np.array([0, 0]), np.array([f.lag.t_s[0] - 1e-3, f.lag.t_s[0]]))
+    _, known = predicted(MODELS, f, np.array([0, 0]), np.array([f.base[0].t_s - 1e-3, f.base[0].t_s]))
     assert known.tolist() == [False, True]
 
 
@@ -224,7 +218,7 @@ def test_before_the_lagged_state_there_is_no_answer() -> None:
 def test_moments_are_those_of_each_mixture(seed: int) -> None:
     rng = np.random.default_rng(seed)
     x, P, mu = rng.normal(size=(3, 2, 4)), covariances(rng, (3, 2), 4), rng.dirichlet([1, 1], 3)
-    mean, covariance = tracks.estimates(TVIMM, x, P, mu)
+    mean, covariance = tracks.estimates(TVIMM, Mixture(x, P, mu))
     for k in range(3):
         for got, want in zip((mean[k], covariance[k]), mixture_moments(x[k], P[k], mu[k]), strict=True):
             np.testing.assert_allclose(got, want, atol=1e-9)
@@ -235,21 +229,30 @@ def test_a_new_track_stands_at_its_plot() -> None:
     f = fresh_filters(MODELS, plot)
     want = np.zeros((4, 4))
     want[:2, :2], want[2:, 2:] = [[4.0, 1.0], [1.0, 9.0]], 150.0**2 * np.eye(2)
-    assert np.array_equal(f.head.x[0], np.tile([100.0, -50.0, 0.0, 0.0], (3, 1)))
-    assert np.array_equal(f.head.P[0], np.tile(want, (3, 1, 1)))
-    assert f.head.mu[0].tolist() == MODELS.start.tolist()
-    assert (f.head.t_s[0], f.lag.t_s[0], f.ring_n[0]) == (3.0, 3.0, 0)
+    head = f.head[0]
+    assert np.array_equal(head.x, np.tile([100.0, -50.0, 0.0, 0.0], (3, 1)))
+    assert np.array_equal(head.P, np.tile(want, (3, 1, 1)))
+    assert head.mu.tolist() == MODELS.start.tolist()
+    assert (head.t_s, f.base[0].t_s, f.t_s[0], f.ring_n[0]) == (3.0, 3.0, 3.0, 0)
 
 
 def test_a_new_track_has_its_own_parameters_at_their_prior() -> None:
     f = fresh_filters(TVIMM, Plot(np.array([100.0, -50.0]), np.array([4.0, 1.0, 9.0]), 3.0))
     w = np.deg2rad(6.0)
-    np.testing.assert_allclose(f.head.x[0, :5, 4], [0.0, 0.55 * w, -0.55 * w, 0.0, 0.0])
-    np.testing.assert_allclose(f.head.P[0, [1, 2, 3, 4], 4, 4], [(0.23 * w) ** 2, (0.23 * w) ** 2, 36.0, 100.0])
-    assert f.head.P[0, 4, 5, 5] == f.head.P[0, 4, 4, 4]
-    assert not f.head.P[0, :, :4, 4:].any()
-    assert f.head.weight[0].tolist() == [0.5, 0.5]
-    assert not f.head.age_s[0].any()
+    head = f.head[0]
+    np.testing.assert_allclose(head.x[:5, 4], [0.0, 0.55 * w, -0.55 * w, 0.0, 0.0])
+    np.testing.assert_allclose(head.P[[1, 2, 3, 4], 4, 4], [(0.23 * w) ** 2, (0.23 * w) ** 2, 36.0, 100.0])
+    assert head.P[4, 5, 5] == head.P[4, 4, 4]
+    assert not head.P[:, :4, 4:].any()
+    assert head.weight.tolist() == [0.5, 0.5]
+    assert not head.age_s.any()
+
+
+def test_what_a_target_can_do_is_two_sigma_of_each_model() -> None:
+    w = np.deg2rad(6.0)
+    assert tracks.strength(MODELS) == (500.0, 0.0, 0.0)
+    # Of singer and speed change the stronger acceleration; of the noise densities that of the rough model.
+    np.testing.assert_allclose(tracks.strength(TVIMM), [36.0, 20.0, 1.01 * w], rtol=1e-12)
 
 
 # --- the quick bound before the gate ---
@@ -279,8 +282,9 @@ def test_no_track_with_a_plot_in_its_gate_is_left_out(
     f, newest = many(models, rng, 12)
     rows, limit = np.arange(12), 16.0
     t = newest + wait + rng.uniform(0, 1, m) * spread_s
+    times = np.full(12, t.mean())
     # Plots at the very edge: on the ellipse of some model of some track.
-    ahead, mu, _ = predicted(models, f, rows, np.full(12, t.mean()))
+    ahead, _ = predicted(models, f, rows, times)
     R = packed(covariances(rng, (m,), 2, 10 ** rng.uniform(1, 5)))
     z = np.empty((m, 2))
     for j in range(m):
@@ -289,26 +293,27 @@ def test_no_track_with_a_plot_in_its_gate_is_left_out(
         angle = rng.uniform(0, 2 * np.pi)
         out = np.linalg.cholesky(S) @ [np.cos(angle), np.sin(angle)] * np.sqrt(limit) * 0.9999
         z[j] = ahead.x[i, a, :2] + out + (t[j] - t.mean()) * ahead.x[i, a, 2:4]
-    times = np.full(12, t.mean())
-    inside, _, _ = gating.gate(ahead.x, ahead.P, mu, times, z, R, t, limit)
+    plots = make_plots(z, R, t)
+    inside, _, _ = gating.gate(ahead, times, plots, limit)
     assert len(inside) >= m
-    near = tracks.near(models, f, rows, z, R, t, limit)
-    assert set(inside.tolist()) <= set(near.tolist())
+    assert set(inside.tolist()) <= set(near(models, f, plots, limit).tolist())
+
+
+def near(models: Models, f: Filters, plots: Plots, limit: float = 16.0) -> IntArray:
+    """Of all rows those that may have a plot in their gate."""
+    return gating.near(f.mean, f.spread, f.t_s, np.arange(len(f.t_s)), plots, limit, tracks.strength(models))
 
 
 @pytest.mark.parametrize("models", [MODELS, TVIMM], ids=["imm", "tvimm"])
 def test_tracks_far_from_all_plots_are_left_out(models: Models) -> None:
     f, newest = many(models, np.random.default_rng(9), 12)
-    z, R = np.array([[5e5, 5e5]]), np.array([[100.0, 0.0, 100.0]])
-    assert not len(tracks.near(models, f, np.arange(12), z, R, np.array([newest + 1.0]), 16.0))
+    assert not len(near(models, f, make_plots([[5e5, 5e5]], [100.0, 0.0, 100.0], newest + 1.0)))
 
 
 def test_each_row_gets_the_time_of_the_plot_nearest_to_it() -> None:
-    f = make_filters(MODELS, 2, RING)
-    begin_row(MODELS, f, 0, Plot(np.array([0.0, 0.0]), np.array([1.0, 0.0, 1.0]), 0.0))
-    begin_row(MODELS, f, 1, Plot(np.array([1000.0, 0.0]), np.array([1.0, 0.0, 1.0]), 0.0))
-    z, t = np.array([[900.0, 50.0], [-300.0, 0.0], [5000.0, 0.0]]), np.array([1.0, 2.0, 3.0])
-    assert tracks.nearest_times(f, np.array([1, 0]), z, t).tolist() == [1.0, 2.0]
+    mean, t_s = np.array([[1000.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]]), np.zeros(2)
+    plots = make_plots([[900.0, 50.0], [-300.0, 0.0], [5000.0, 0.0]], [1.0, 0.0, 1.0], [1.0, 2.0, 3.0])
+    assert gating.nearest_times(mean, t_s, plots).tolist() == [1.0, 2.0]
     # A row that moves is taken along to the time of each plot.
-    f.mean[0, 2] = 2000.0
-    assert tracks.nearest_times(f, np.array([0]), z, t).tolist() == [3.0]
+    mean[1, 2] = 2000.0
+    assert gating.nearest_times(mean[1:], t_s[1:], plots).tolist() == [3.0]

@@ -5,17 +5,15 @@ import pytest
 import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.services.estimation.makers import LAW, FloatArray, sojourns
+from tests.services.estimation.makers import LAW, FloatArray, chain, sojourns
 
-from trackmesh.services.estimation.transition import generator, stationary, transition_matrix
+from trackmesh.services.estimation.transition import generator, stationary, uniformised
 
 times_s = st.floats(0.0, 1000.0)
 
 
 def matrix(sojourn_s: FloatArray, dt_s: float) -> FloatArray:
-    out = np.empty((len(sojourn_s), len(sojourn_s)))
-    transition_matrix(generator(sojourn_s), dt_s, out)
-    return out
+    return chain(generator(sojourn_s), dt_s)
 
 
 def written_out(sojourn_s: FloatArray) -> FloatArray:
@@ -79,17 +77,16 @@ def test_any_jumps_give_the_matrix_exponential(seed: int, r: int, dt: float) -> 
     J = rng.dirichlet(np.full(r, 0.3), r) * (1.0 - np.eye(r)) + np.roll(np.eye(r), 1, axis=1) * rng.uniform(0, 3)
     J /= J.sum(axis=1, keepdims=True)
     tau = rng.uniform(1.0, 100.0, r)
-    out = np.empty((r, r))
-    transition_matrix(generator(tau, J), dt, out)
-    np.testing.assert_allclose(out, scipy.linalg.expm((J - np.eye(r)) / tau[:, None] * dt), atol=1e-11)
+    np.testing.assert_allclose(
+        chain(generator(tau, J), dt), scipy.linalg.expm((J - np.eye(r)) / tau[:, None] * dt), atol=1e-11
+    )
 
 
 def test_a_chain_without_eigenvectors() -> None:
     J, tau = np.array([[0.0, 1.0, 0.0], [0.5, 0.0, 0.5], [0.0, 1.0, 0.0]]), np.array([1.0, 1.0, 1.0])
     J[2], J[0] = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
     for dt in (0.1, 3.0, 1e6, 1e300):
-        out = np.empty((3, 3))
-        transition_matrix(generator(tau, J), dt, out)
+        out = chain(generator(tau, J), dt)
         np.testing.assert_allclose(out.sum(axis=1), 1.0, atol=1e-14)
         if dt < 1e6:
             np.testing.assert_allclose(out, scipy.linalg.expm((J - np.eye(3)) * dt), atol=1e-13)
@@ -101,3 +98,14 @@ def test_a_chain_without_eigenvectors() -> None:
 def test_jumps_that_are_none_are_refused(J: FloatArray) -> None:
     with pytest.raises(ValueError, match="jumps must be"):
         generator(np.ones(2), np.asarray(J))
+
+
+@LAW
+@given(sojourns, st.integers(0, 3))
+def test_a_uniformised_chain_jumps_at_one_rate(tau: FloatArray, more: int) -> None:
+    r = len(tau)
+    U, rate = uniformised(generator(tau), r + more)
+    assert np.all(U >= 0)
+    np.testing.assert_allclose(U.sum(axis=1), 1.0, atol=1e-15)
+    np.testing.assert_allclose(rate * (U[:r, :r] - np.eye(r)), generator(tau), rtol=1e-12, atol=1e-15)
+    assert np.array_equal(U[r:], np.eye(r + more)[r:])

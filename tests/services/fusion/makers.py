@@ -14,8 +14,10 @@ from trackmesh.protocol.codec import decode, encode
 from trackmesh.protocol.messages import PlotBatch, ScanPart, SensorInfo, TrackFrame
 from trackmesh.services.estimation.bank import make_models
 from trackmesh.services.estimation.filters import velocity_models
+from trackmesh.services.estimation.plots import Plots, make_plots
+from trackmesh.services.estimation.tracks import ImmTracks
 from trackmesh.services.fusion.engine import FusionEngine, Unit
-from trackmesh.services.fusion.layer import Layer, Look, Plots
+from trackmesh.services.fusion.layer import Layer, Look
 from trackmesh.services.fusion.life import Rules
 from trackmesh.services.fusion.settings import EngineSettings
 
@@ -191,23 +193,36 @@ def short_run() -> list[list[float]]:
 # --- layers ---
 
 
-def layer(rules: Rules = RULES, sensors: int = 1, ring: int = 6, rows: int = 64) -> Layer:
+class ImmLayer(Layer):
+    """A layer of which a test may look at the filters."""
+
+    filters: ImmTracks
+
+
+def layer(rules: Rules = RULES, sensors: int = 1, ring: int = 6, rows: int = 64) -> ImmLayer:
     models = make_models((velocity_models([10.0, 500.0], [30.0, 15.0]),))
-    return Layer(models, rules, ring, sensors, 16.0, 150.0, rows)
+    return ImmLayer(ImmTracks(models, rows, ring, 150.0), rules, sensors, 16.0)
 
 
 def look(t_s: float, **change: Any) -> Look:
     """A whole look of a radar at the middle of the plane."""
     known = Look(
         sensor=0, t_s=t_s, site=np.zeros(2), max_range_m=120e3, period_s=4.0, p_detect=0.9, whole=True, margin_s=0.0,
-        lately_s=np.inf, clutter_density=1e-9,
+        lately_s=np.inf, clutter_density=1e-9, reference_density=1e-9,
     )  # fmt: skip
     return known._replace(**change)
 
 
-def plots(t_s: float, place: FloatArray, sigma_m: float = 50.0) -> Plots:
-    z = np.asarray(place, float).reshape(-1, 2)
-    return Plots(z, np.tile([sigma_m**2, 0.0, sigma_m**2], (len(z), 1)), np.full(len(z), float(t_s)))
+def plots(t_s: float | FloatArray, place: FloatArray, sigma_m: float = 50.0) -> Plots:
+    return make_plots(place, [sigma_m**2, 0.0, sigma_m**2], t_s)
+
+
+def confirm(bank: Layer, *place: tuple[float, float], until_s: float = 12.0) -> list[int]:
+    """Rows of tracks that stand at these places and were confirmed by ``until_s``, a look every four seconds."""
+    for t in np.arange(0.0, until_s + 1, 4.0).tolist():
+        done = bank.step(plots(t, np.array(place)), look(t), t)
+    assert bank.life.confirmed[done.row].all()
+    return [int(row) for row in done.row]
 
 
 # --- what lies beside the repository ---

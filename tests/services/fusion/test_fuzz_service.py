@@ -186,34 +186,53 @@ def test_broken_sensors_change_nothing() -> None:
         assert service.service.engine.sensors["north"].info == info
 
 
-def test_the_most_extreme_legal_plots_leave_every_frame_readable() -> None:
+WILD = [
+    ["range_m", "azimuth_rad"],
+    ["east_m", "north_m"],
+    ["range_m", "azimuth_rad", "elevation_rad", "range_rate_mps"],
+]
+
+
+def wild_batch(k: int, rng: np.random.Generator) -> PlotBatch:
+    """Plots within the bounds of the protocol, many at its edges."""
+    n, columns = int(rng.integers(0, 6)), WILD[k % 3]
+    low, high = np.array([COLUMN_BOUNDS[name] for name in columns]).T
+    shape = (n, len(columns))
+    values = np.where(rng.random(shape) < 0.3, rng.choice([low[0], high[0], 0.0]), rng.uniform(low, high, shape))
+    most = np.array([LARGEST_SIGMA.get(name, 1e9) ** 2 for name in columns])
+    return PlotBatch(
+        sensor_id="wild",
+        boot_id="boot",
+        seq=k,
+        t_ns=BEGIN_NS + k * PERIOD_NS // 4 - rng.integers(0, 20 * 10**9, n),
+        columns=columns,
+        values=np.clip(values, low, high),
+        variances=np.minimum(10.0 ** rng.uniform(-18, 18, shape), most),
+    )
+
+
+@pytest.mark.parametrize("lag", [0, 2])
+def test_the_most_extreme_legal_plots_leave_every_frame_readable(lag: int) -> None:
     rng = np.random.default_rng(17)
     usual = good_traffic()
-    with Running("data") as service:
+    with Running("data", engine={"lag": lag}) as service:
+        looking_back = service.client.watch_refined(capacity=100_000)
         service.sensor(radar("north"))
         service.sensor(radar("wild"))
         for k in range(200):
-            n = int(rng.integers(0, 6))
-            columns = ["range_m", "azimuth_rad"] if k % 2 else ["east_m", "north_m"]
-            low, high = np.array([COLUMN_BOUNDS[name] for name in columns]).T
-            values = np.where(
-                rng.random((n, 2)) < 0.3, rng.choice([low[0], high[0], 0.0]), rng.uniform(low, high, (n, 2))
-            )
-            most = np.array([LARGEST_SIGMA.get(name, 1e9) ** 2 for name in columns])
-            variances = np.minimum(10.0 ** rng.uniform(-18, 18, (n, 2)), most)
-            t_ns = BEGIN_NS + k * PERIOD_NS // 4 - rng.integers(0, 20 * 10**9, n)
-            values = np.clip(values, low, high)
-            batch = plot_batch("wild", k, t_ns, values.tolist(), columns=columns, variances=variances)
-            service.plots("wild", batch)
+            service.plots("wild", wild_batch(k, rng))
             if k % 4 == 0:
                 service.plots("north", usual[k // 4])
             service.settle()
             far = TrackQuery(at_t_ns=int(rng.choice([0, BEGIN_NS + 10**15, 2**62, 2**63 - 1])), status=[0, 1, 2])
             service.client.query_tracks(far)
         frames = list(iter(lambda: service.frames.receive(0.0), None))
+        refined = list(iter(lambda: looking_back.receive(0.0), None))
     assert not service.refused
     assert not service.frames.refused
+    assert not looking_back.refused
     assert len(frames) >= 250
+    assert (len(refined) > 20) == bool(lag)
 
 
 @pytest.mark.parametrize("fmt", ["", "fmt=json"])

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.stats
-from tests.services.fusion.makers import RULES, FloatArray, layer, look, plots
+from tests.services.fusion.makers import RULES, FloatArray, confirm, layer, look, plots
 
 from trackmesh.services.fusion.layer import Layer, Step
 
@@ -11,14 +11,6 @@ from trackmesh.services.fusion.layer import Layer, Step
 def step(bank: Layer, t_s: float, *place: tuple[float, float]) -> Step:
     """One whole look at these places."""
     return bank.step(plots(t_s, np.array(place)), look(t_s), t_s)
-
-
-def confirmed_at(bank: Layer, *place: tuple[float, float], until_s: float = 12.0) -> list[int]:
-    """Rows of tracks that stand at these places and were confirmed by ``until_s``."""
-    for t in np.arange(0.0, until_s + 1, 4.0).tolist():
-        done = step(bank, t, *place)
-    assert bank.life.confirmed[done.row].all()
-    return [int(row) for row in done.row]
 
 
 def test_unused_plots_start_tracks_that_become_confirmed() -> None:
@@ -36,7 +28,7 @@ def test_unused_plots_start_tracks_that_become_confirmed() -> None:
 
 def test_a_plot_belongs_to_one_track_and_a_track_takes_one_plot() -> None:
     bank = layer()
-    row = confirmed_at(bank, (0, 0))[0]
+    row = confirm(bank, (0, 0))[0]
     done = step(bank, 16.0, (10, 0), (-20, 0))
     assert (done.row == row).sum() == 1
     assert done.row[0] == row, "the nearer plot"
@@ -45,7 +37,7 @@ def test_a_plot_belongs_to_one_track_and_a_track_takes_one_plot() -> None:
 
 def test_confirmed_tracks_choose_first() -> None:
     bank = layer()
-    row = confirmed_at(bank, (0, 0))[0]
+    row = confirm(bank, (0, 0))[0]
     # A tentative track fits the only plot better, but that is in the confirmed one's gate as well.
     for t in (16.0, 20.0):
         assert step(bank, t, (0, 0), (350, 0)).row[0] == row
@@ -56,12 +48,12 @@ def test_confirmed_tracks_choose_first() -> None:
 def test_the_score_is_the_likelihood_ratio() -> None:
     bank, density = layer(), 1e-9
     first = step(bank, 0.0, (0, 0)).row[0]
-    x, P, mu = (a[first].copy() for a in (bank.filters.head.x, bank.filters.head.P, bank.filters.head.mu))
+    x, P, mu = (bank.filters.filters.head[first][name].copy() for name in ("x", "P", "mu"))
     place: FloatArray = np.array([120.0, -80.0])
     ahead, covariance, weight = bank.predict(np.array([first]), 4.0)
     assert x[:, 0].tolist() == [0.0, 0.0]
     likelihood = 0.0
-    for q, w in zip(bank.models.numbers[:, 0], weight[0], strict=True):
+    for q, w in zip(bank.filters.models.numbers[:, 0], weight[0], strict=True):
         # Both models start alike; only their process noise differs.
         S = P[0][:2, :2] + 16.0 * P[0][2:, 2:] + (q * 64.0 / 3.0 + 2500.0) * np.eye(2)
         likelihood += w * scipy.stats.multivariate_normal(np.zeros(2), S).pdf(place)
@@ -93,7 +85,7 @@ def test_scores_go_to_the_rows_they_belong_to() -> None:
 
 def test_misses_end_a_tentative_track_and_time_a_confirmed_one() -> None:
     bank = layer()
-    row = confirmed_at(bank, (0, 0))[0]
+    row = confirm(bank, (0, 0))[0]
     lone = step(bank, 16.0, (0, 0), (2e4, 0)).row[1]
     uid, link = int(bank.life.uid[row]), int(bank.life.link[row])
     lone_uid = bank.life.uid[lone]
@@ -133,12 +125,12 @@ def test_the_bank_grows_and_tracks_stay_in_their_rows() -> None:
     second = step(bank, 4.0, *places)
     assert second.row.tolist() == first.row.tolist()
     assert bank.life.hits[first.row].tolist() == [2] * 100
-    assert len(bank.life.uid) == len(bank.filters.head.t_s) == 128
+    assert len(bank.life.uid) == len(bank.filters.t_s) == 128
 
 
 def test_sensors_can_be_added_while_tracks_live() -> None:
     bank = layer(sensors=1)
-    row = confirmed_at(bank, (0, 0))[0]
+    row = confirm(bank, (0, 0))[0]
     bank.life.member[row, 0] = 5
     before = bank.life.seen_s[row, 0]
     bank.add_sensors(3)
@@ -168,21 +160,21 @@ def test_late_plots_reach_their_track_and_too_late_ones_do_not_move_it() -> None
     for t in times:
         in_order.step(plots(t, np.array([(100 * t, 0.0)])), look(t), t)
     assert late.rows.tolist() == in_order.rows.tolist()
-    assert np.array_equal(late.filters.head.x, in_order.filters.head.x)
-    before = late.filters.head.x[late.rows[0]].copy()
+    assert late.filters.filters.head.tobytes() == in_order.filters.filters.head.tobytes()
+    before = late.filters.filters.head[late.rows[0]].copy()
     done = late.step(plots(0.5, np.array([(50.0, 0.0)])), look(0.5), 16.0)
     assert done.row[0] != late.rows[0]
-    assert np.array_equal(late.filters.head.x[late.rows[0]], before)
+    assert late.filters.filters.head[late.rows[0]].tobytes() == before.tobytes()
 
 
 def test_plots_of_one_batch_may_have_their_own_times() -> None:
     bank, speed = layer(), 250.0
     for turn in range(5):
         t = 4.0 * turn + np.array([0.5, 3.5])
-        both = plots(0.0, np.array([(speed * t[0], 0.0), (0.0, 3e4 - speed * t[1])]))._replace(t_s=t)
+        both = plots(t, np.array([(speed * t[0], 0.0), (0.0, 3e4 - speed * t[1])]))
         done = bank.step(both, look(4.0 * turn + 3.5), 4.0 * turn + 3.5)
     assert bank.life.confirmed[done.row].all()
-    assert bank.filters.head.t_s[done.row].tolist() == [16.5, 19.5]
+    assert bank.filters.t_s[done.row].tolist() == [16.5, 19.5]
     mean, _, _ = bank.predict(done.row, 20.0)
     np.testing.assert_allclose(mean[:, :2], [[5000, 0], [0, 25000]], atol=60)
 

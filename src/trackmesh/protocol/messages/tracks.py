@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
@@ -28,14 +29,22 @@ TrackId = Annotated[int, Field(ge=0, le=2**53)]
 _UPPER = np.triu_indices(6)
 
 
+def _symmetric(upper: npt.NDArray[np.float32]) -> FloatArray:
+    full = np.zeros((len(upper), 6, 6))
+    full[:, _UPPER[0], _UPPER[1]] = upper
+    full[:, _UPPER[1], _UPPER[0]] = upper
+    return full
+
+
 class TrackFrame(TopMessage):
     """One atomic picture: the tracks that a unit owns, predicted to ``t_ns``.
 
     ``state`` is [east_m, north_m, veast, vnorth, aeast, anorth] in the system plane; a filter without acceleration pads
     it, and its covariance, with zeros. ``covariance`` is the upper triangle of the 6x6 matrix, row by row;
     ``covariance_matrices()`` gives it whole. ``status`` is 0 tentative, 1 confirmed, 2 coasting, 3 ended. ``members``
-    holds, per sensor of ``sensors``, the id of the local track that took the same plots, or -1. A track missing from
-    a frame has not ended: only status 3, or silence, ends it.
+    holds, per sensor of ``sensors``, the id of the local track that took the same plots, or -1. ``manoeuvre_fit`` is
+    the weight of the models of turns and speed changes against a generic filter, where a filter has both. A track
+    missing from a frame has not ended: only status 3, or silence, ends it.
     """
 
     unit_id: Id
@@ -52,6 +61,7 @@ class TrackFrame(TopMessage):
     height_variance_m2: Annotated[FloatArray, ArrayField("<f8", ("n",), ge=0)] | None = None
     model_probability: Annotated[FloatArray, ArrayField("<f8", ("n", "r"), ge=0, le=1)]
     models: Annotated[list[str], Axis("r"), Field(fail_fast=True)]
+    manoeuvre_fit: Annotated[FloatArray, ArrayField("<f8", ("n",), ge=0, le=1)] | None = None
     sensors: Annotated[list[Id], Axis("s"), Field(fail_fast=True)]
     members: Annotated[IntArray, ArrayField("<i8", ("n", "s"), ge=-1)]
     updated_t_ns: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0)]
@@ -59,10 +69,29 @@ class TrackFrame(TopMessage):
 
     def covariance_matrices(self) -> FloatArray:
         """Covariances as full symmetric matrices, shape (n, 6, 6)."""
-        full = np.zeros((len(self.track_id), 6, 6))
-        full[:, _UPPER[0], _UPPER[1]] = self.covariance
-        full[:, _UPPER[1], _UPPER[0]] = self.covariance
-        return full
+        return _symmetric(self.covariance)
+
+
+class RefinedFrame(TopMessage):
+    """Where tracks were some plots ago, as it is known now: each at a time of its own, refined by ``lag`` later plots.
+
+    Only tracks that took a plot since the last such message are in it. ``state`` and ``covariance`` as in
+    ``TrackFrame``.
+    """
+
+    unit_id: Id
+    boot_id: BootId
+    seq: Seq
+    t_ns: UnixNs
+    lag: Annotated[int, Field(ge=1, le=4)]
+    track_id: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0, le=2**53)]
+    state_t_ns: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0)]
+    state: Annotated[FloatArray, ArrayField("<f8", ("n", 6))]
+    covariance: Annotated[Float32Array, ArrayField("<f4", ("n", 21))]
+
+    def covariance_matrices(self) -> FloatArray:
+        """Covariances as full symmetric matrices, shape (n, 6, 6)."""
+        return _symmetric(self.covariance)
 
 
 class TrackQuery(TopMessage):

@@ -6,6 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -37,6 +38,12 @@ def track(
     plots: Annotated[Path, typer.Argument(metavar="PLOTS.jsonl", help="A recording, or a black box.")],
     out_path: Annotated[Path, typer.Option("--out", metavar="TRACKS.jsonl", help="File to write.")],
     config: Config = None,
+    refined: Annotated[
+        Path | None,
+        typer.Option(
+            "--refined", metavar="REFINED.jsonl", help="Write here the refined states, where engine.lag is set."
+        ),
+    ] = None,
 ) -> None:
     """Track a recording, without a network. The same engine as live, and the same frames."""
     from trackmesh.services.fusion.offline import OfflineRun
@@ -45,7 +52,11 @@ def track(
     settings = FusionSettings.load(config)
     run = OfflineRun(settings.engine, settings.unit_id, settings.unit_number, settings.origin)
     count, started_s = 0, time.process_time()
-    with RecordWriter(out_path) as file, progress_bar("tracking", _lines(plots)) as advance:
+    with ExitStack() as opened:
+        file = opened.enter_context(RecordWriter(out_path))
+        if refined is not None:
+            run.on_refined = opened.enter_context(RecordWriter(refined)).write
+        advance = opened.enter_context(progress_bar("tracking", _lines(plots)))
         for frame in run.frames(_counted(read_records(plots), advance)):
             file.write(frame)
             count += 1

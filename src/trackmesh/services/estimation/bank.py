@@ -4,17 +4,21 @@ A filter has one or more *branches*, each an interacting multiple model filter o
 same plots, never feed each other, and are averaged by their predictive evidence. ``imm`` and ``tvimm-dirichlet`` have
 one branch, ``tvimm`` has two. Models of different state length live side by side: the first four components are
 position and velocity, the rest are the model's own parameters.
+
+Models, states and scratch are numpy records. Their fields have a fixed shape, which is part of the type that numba
+compiles for: the numbers of models and of states are constants of the compiled code, and a track is one block of
+memory.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from trackmesh.services.estimation.motion import STATES, Model
-from trackmesh.services.estimation.transition import generator, stationary
+from trackmesh.services.estimation.transition import generator, stationary, uniformised
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -44,26 +48,28 @@ class Branch(NamedTuple):
     split_s: float = NEVER_SPLIT
 
 
-class Models(NamedTuple):
-    """All branches as arrays, for the kernels; r models in all, b branches, the longest state d.
+class Models(Protocol):
+    """All branches as one record, for the kernels; r models in all, b branches, the longest state d.
 
     Attributes:
         kind, states: (r,). numbers: (r, 4) q, mean, sd, time_s.
         first: (b + 1,) first model of each branch, and r.
-        generator: (r, width) G of each branch's chain, one below the other; width is that of the longest branch.
+        jump, rate: (b, width, width), (b,): each branch's chain, uniformised; width is that of the longest branch.
         start: (r,) initial probabilities, summing to one in each branch.
         prior_count: (b,). age_s: (r,), 0 where a model has no memory of its age.
         split_s: (b,).
         share: how much weight the branches exchange at every update.
         memory_s, reference_s: of observed transitions.
         printed: the transition matrix, the probabilities and the output follow the published TV-IMM instead.
+        lags: how many plots ago the states reach that are refined.
     """
 
     kind: IntArray
     states: IntArray
     numbers: FloatArray
     first: IntArray
-    generator: FloatArray
+    jump: FloatArray
+    rate: FloatArray
     start: FloatArray
     prior_count: FloatArray
     age_s: FloatArray
@@ -71,7 +77,8 @@ class Models(NamedTuple):
     share: float
     memory_s: float
     reference_s: float
-    printed: bool
+    printed: int
+    lags: int
 
 
 def make_models(
@@ -81,6 +88,7 @@ def make_models(
     memory_s: float = 80.0,
     reference_s: float = 4.0,
     printed: bool = False,
+    lags: int = 0,
 ) -> Models:
     """Models of the given branches.
 
@@ -93,25 +101,33 @@ def make_models(
         raise ValueError("share must be from 0 to 1")
     if not branches or (printed and len(branches) > 1):
         raise ValueError("a filter needs a branch, and the published TV-IMM has no more than one")
+    if lags < 0 or (printed and lags):
+        raise ValueError("lags must not be negative, and the published TV-IMM has none")
     models = [m for branch in branches for m in branch.models]
     chains = [_generator(branch) for branch in branches]
     starts = [np.array(b.start) if b.start else stationary(c) for b, c in zip(branches, chains, strict=True)]
     ages = [b.age_s or (0.0,) * len(b.models) for b in branches]
     width = max(len(b.models) for b in branches)
-    return Models(
-        kind=np.array([m.kind for m in models]),
-        states=np.array([STATES[m.kind] for m in models]),
-        numbers=np.array([[m.q, m.mean, m.sd, m.time_s] for m in models], float),
-        first=np.cumsum([0, *(len(b.models) for b in branches)]),
-        generator=_padded(chains, width),
-        start=np.concatenate(starts),
-        prior_count=np.array([b.prior_count for b in branches], float),
-        age_s=np.concatenate([np.array(a, float) for a in ages]),
-        split_s=np.array([b.split_s for b in branches], float),
-        share=share,
-        memory_s=memory_s,
-        reference_s=reference_s,
-        printed=printed,
+    uniform = [uniformised(c, width) for c in chains]
+    return cast(
+        "Models",
+        _record(
+            kind=np.array([m.kind for m in models]),
+            states=np.array([STATES[m.kind] for m in models]),
+            numbers=np.array([[m.q, m.mean, m.sd, m.time_s] for m in models], float),
+            first=np.cumsum([0, *(len(b.models) for b in branches)]),
+            jump=np.array([jump for jump, _ in uniform]),
+            rate=np.array([rate for _, rate in uniform]),
+            start=np.concatenate(starts),
+            prior_count=np.array([b.prior_count for b in branches], float),
+            age_s=np.concatenate([np.array(a, float) for a in ages]),
+            split_s=np.array([b.split_s for b in branches], float),
+            share=share,
+            memory_s=memory_s,
+            reference_s=reference_s,
+            printed=int(printed),
+            lags=lags,
+        ),
     )
 
 
@@ -129,19 +145,31 @@ def _generator(branch: Branch) -> FloatArray:
     return generator(np.array(branch.sojourn_s), branch.jumps)
 
 
-def _padded(blocks: list[FloatArray], width: int) -> FloatArray:
-    """Square blocks one below the other, (r, width)."""
-    return np.concatenate([np.pad(b, ((0, 0), (0, width - b.shape[1]))) for b in blocks])
+def _record(**fields: object) -> object:
+    """One record of these fields."""
+    values = {name: np.asarray(value) for name, value in fields.items()}
+    dtype = np.dtype((np.record, [(name, v.dtype, v.shape) for name, v in values.items()]))
+    record = np.zeros(1, dtype)
+    for name, value in values.items():
+        record[name][0] = value
+    return record[0]
 
 
-class State(NamedTuple):
-    """The filters of n rows at the time of each.
+def as_array(record: object) -> npt.NDArray[Any]:
+    """A record of models or scratch as an array of one: compiled functions take that ten times faster than a record."""
+    return cast("npt.NDArray[Any]", cast("np.record", record).base)
+
+
+class State(Protocol):
+    """The filter of one track.
 
     Attributes:
-        x, P: (n, r, d), (n, r, d, d), of which a model uses its own length.
-        mu: (n, r) probability within the branch. weight: (n, b) of the branches.
-        counts: (n, r, width) observed transitions within the branch. age_s: (n, r) time spent in each model.
-        t_s: (n,).
+        x, P: (r, d), (r, d, d), of which a model uses its own length.
+        mu: (r,) probability within the branch. weight: (b,) of the branches.
+        counts: (r, width) observed transitions within the branch. age_s: (r,) time spent in each model.
+        t_s: its time.
+        y, C, Y: of position and velocity some plots ago, nearest first: (lags, r, 4), their covariance with the present
+            state (lags, r, d, 4), their own (lags, r, 4, 4). y_t_s: (lags,) when that was.
     """
 
     x: FloatArray
@@ -150,31 +178,91 @@ class State(NamedTuple):
     weight: FloatArray
     counts: FloatArray
     age_s: FloatArray
-    t_s: FloatArray
+    t_s: float
+    y: FloatArray
+    C: FloatArray
+    Y: FloatArray
+    y_t_s: FloatArray
 
 
-def make_state(models: Models, n: int) -> State:
-    """State of n empty rows."""
-    r, width, b, d = len(models.kind), models.generator.shape[1], len(models.split_s), int(models.states.max())
-    return State(
-        x=np.zeros((n, r, d)),
-        P=np.zeros((n, r, d, d)),
-        mu=np.zeros((n, r)),
-        weight=np.zeros((n, b)),
-        counts=np.zeros((n, r, width)),
-        age_s=np.zeros((n, r)),
-        t_s=np.zeros(n),
-    )
+States: TypeAlias = npt.NDArray[Any]
+"""The filters of many tracks: an array of records with the fields of ``State``."""
 
 
-class Work(NamedTuple):
-    """Scratch of the kernels for one track."""
+def make_states(models: Models, n: int) -> States:
+    """States of n empty rows."""
+    r, width, b, d, lags = _sizes(models)
+    fields = [
+        ("x", (r, d)),
+        ("P", (r, d, d)),
+        ("mu", (r,)),
+        ("weight", (b,)),
+        ("counts", (r, width)),
+        ("age_s", (r,)),
+        ("t_s", ()),
+        ("y", (lags, r, 4)),
+        ("C", (lags, r, d, 4)),
+        ("Y", (lags, r, 4, 4)),
+        ("y_t_s", (lags,)),
+    ]
+    # A plain array of records, not a recarray: numba recognises its type four times faster.
+    return np.zeros(n, np.dtype((np.record, [(name, "f8", shape) for name, shape in fields])))
+
+
+class Work(Protocol):
+    """Scratch of the kernels, and what they count.
+
+    Attributes:
+        pi: (r, width) transition matrix of each branch, one below the other. step: (width, width) of one.
+        weight: (width, width) share of model a in what comes to model j. powers, F, product, block, gain: scratch.
+        x, P, y, C, Y: (width, ...) what mixing gives.
+        before, c, log_likelihood: (r,).
+        repairs: how often a covariance that was none had to be replaced.
+    """
 
     pi: FloatArray
+    step: FloatArray
+    weight: FloatArray
+    powers: FloatArray
+    F: FloatArray
+    product: FloatArray
+    block: FloatArray
+    gain: FloatArray
     x: FloatArray
     P: FloatArray
+    y: FloatArray
+    C: FloatArray
+    Y: FloatArray
     before: FloatArray
     c: FloatArray
     log_likelihood: FloatArray
-    motion: FloatArray
-    gain: FloatArray
+    repairs: int
+
+
+def make_work(models: Models) -> Work:
+    """Scratch for the filters of these models; not to be used by two threads at once."""
+    r, width, _, d, _ = _sizes(models)
+    shapes = {
+        "pi": (r, width),
+        "step": (width, width),
+        "weight": (width, width),
+        "powers": (3, width, width),
+        "F": (6, 6),
+        "product": (6, 6),
+        "block": (6,),
+        "gain": (6, 2),
+        "x": (width, d),
+        "P": (width, d, d),
+        "y": (width, 4),
+        "C": (width, d, 4),
+        "Y": (width, 4, 4),
+        "before": (r,),
+        "c": (r,),
+        "log_likelihood": (r,),
+    }
+    return cast("Work", _record(**{name: np.zeros(shape) for name, shape in shapes.items()}, repairs=0))
+
+
+def _sizes(models: Models) -> tuple[int, int, int, int, int]:
+    """Numbers r of models, of the longest branch, b of branches, d of states, of lags."""
+    return len(models.kind), models.jump.shape[1], len(models.split_s), int(models.states.max()), int(models.lags)

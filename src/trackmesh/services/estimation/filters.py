@@ -10,7 +10,7 @@ import numpy as np
 from trackmesh.services.estimation.bank import Branch
 from trackmesh.services.estimation.motion import CONSTANT_VELOCITY, SINGER, TANGENTIAL, TURN, Model
 
-FilterName = Literal["tvimm", "tvimm-dirichlet", "tvimm-paper", "imm"]
+FilterName = Literal["tvimm", "tvimm-dirichlet", "tvimm-paper", "imm", "alpha-beta"]
 
 
 def velocity_models(q_m2ps3: list[float], sojourn_s: list[float], prior_count: float = math.inf) -> Branch:

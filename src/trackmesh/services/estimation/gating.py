@@ -1,27 +1,90 @@
-"""Which plots can belong to which tracks: an ellipse around each predicted position."""
+"""Which plots can belong to which tracks: a circle around each for a first look, then the ellipses of its models."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from trackmesh.services.estimation.jit import kernel
+from trackmesh.services.estimation.plots import Plots
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 
+class Mixture(NamedTuple):
+    """Position and velocity of m tracks, model by model: (m, r, 4), (m, r, 4, 4), probabilities (m, r)."""
+
+    x: FloatArray
+    P: FloatArray
+    mu: FloatArray
+
+
+def make_mixture(m: int, r: int) -> Mixture:
+    """Room for m mixtures of r models."""
+    return Mixture(np.zeros((m, r, 4)), np.zeros((m, r, 4, 4)), np.zeros((m, r)))
+
+
+class Strength(NamedTuple):
+    """What a target can do: acceleration noise q in m^2/s^3, acceleration, turn rate."""
+
+    q: float
+    acceleration_mps2: float
+    turn_rate_radps: float
+
+
+@kernel
+def near(
+    mean: FloatArray,
+    spread: FloatArray,
+    t_s: FloatArray,
+    rows: IntArray,
+    plots: Plots,
+    limit: float,
+    strength: Strength,
+) -> IntArray:
+    """The rows that may have a plot in their gate: a generous circle around each touches the plots' bounding box.
+
+    Args:
+        mean, t_s: (n, 4), (n,) of all tracks, at their last plots.
+        spread: (n, 3) greatest variance of position, its covariance with velocity, and variance of velocity.
+        rows: those asked for.
+    """
+    east0 = north0 = early = np.inf
+    east1 = north1 = late = -np.inf
+    r_max = 0.0
+    for j in range(len(plots)):
+        plot = plots[j]
+        east0, east1 = min(east0, plot.z[0]), max(east1, plot.z[0])
+        north0, north1 = min(north0, plot.z[1]), max(north1, plot.z[1])
+        early, late = min(early, plot.t_s), max(late, plot.t_s)
+        r_max = max(r_max, plot.R[0] + plot.R[2])
+    chosen = np.empty(len(rows), np.int64)
+    n = 0
+    for i in rows:
+        dt = (early + late) / 2.0 - t_s[i]
+        span = abs(dt) + (late - early) / 2.0
+        speed = np.hypot(mean[i, 2], mean[i, 3])
+        drift = 0.5 * span * span * max(strength.acceleration_mps2, strength.turn_rate_radps * speed)
+        variance = spread[i, 0] + 2.0 * span * spread[i, 1] + span * span * spread[i, 2] + strength.q * span**3
+        variance += drift * drift
+        reach = np.sqrt(limit * (variance + r_max)) + speed * (late - early) / 2.0
+        if dt < 0.0:
+            reach += speed * -dt
+        e, north = mean[i, 0] + dt * mean[i, 2], mean[i, 1] + dt * mean[i, 3]
+        if east0 - reach <= e <= east1 + reach and north0 - reach <= north <= north1 + reach:
+            chosen[n] = i
+            n += 1
+    return chosen[:n]
+
+
 @kernel
 def gate(
-    x: FloatArray,
-    P: FloatArray,
-    mu: FloatArray,
+    tracks: Mixture,
     t_s: FloatArray,
-    z: FloatArray,
-    R: FloatArray,
-    z_t_s: FloatArray,
+    plots: Plots,
     limit: float,
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """All pairs of track and plot within the gate of at least one model, with the cost of the pair.
@@ -34,22 +97,26 @@ def gate(
     times differ by less than a scan).
 
     Args:
-        x: (n, r, 4) predicted states. P: (n, r, 4, 4). mu: (n, r). t_s: (n,) their times.
-        z: (m, 2) plots. R: (m, 3) covariances [ee, en, nn]. z_t_s: (m,) their times.
+        tracks: n predicted mixtures. t_s: (n,) their times.
+        plots: (m,); their range rates are not looked at.
         limit: largest squared distance.
 
     Returns:
         track index, plot index, cost of each pair, in order of track, then north.
     """
+    x, P, mu = tracks
     n, r = mu.shape
-    m = len(z)
-    order = np.argsort(z[:, 1])
-    north = z[order, 1]
+    m = len(plots)
+    values = np.empty(m)
     r_max = 0.0
     late, early = -np.inf, np.inf
     for j in range(m):
-        r_max = max(r_max, R[j, 2])
-        late, early = max(late, z_t_s[j]), min(early, z_t_s[j])
+        plot = plots[j]
+        values[j] = plot.z[1]
+        r_max = max(r_max, plot.R[2])
+        late, early = max(late, plot.t_s), min(early, plot.t_s)
+    order = np.argsort(values)
+    north = values[order]
     size = 8 * (n + m) + 64
     ii: IntArray = np.empty(size, np.int64)
     jj: IntArray = np.empty(size, np.int64)
@@ -65,7 +132,7 @@ def gate(
         while k < m and north[k] <= high:
             j = order[k]
             k += 1
-            value = mixture_cost(x[i], P[i], mu[i], z[j], R[j], z_t_s[j] - t_s[i], limit)
+            value = mixture_cost(x[i], P[i], mu[i], plots[j].z, plots[j].R, plots[j].t_s - t_s[i], limit)
             if np.isinf(value):
                 continue
             if count == size:
@@ -100,6 +167,25 @@ def mixture_cost(
         else:
             total += np.exp(log_weight - top)
     return -2.0 * (top + np.log(total)) if inside else np.inf
+
+
+@kernel
+def nearest_times(mean: FloatArray, t_s: FloatArray, plots: Plots) -> FloatArray:
+    """The time of the plot nearest to each row, with the row moved to the plot's time: when the sensor looked at it.
+
+    Args:
+        mean: (n, 4) states. t_s: (n,) their times.
+    """
+    out = np.empty(len(mean))
+    for i in range(len(mean)):
+        best = np.inf
+        for j in range(len(plots)):
+            dt = plots[j].t_s - t_s[i]
+            de = plots[j].z[0] - mean[i, 0] - dt * mean[i, 2]
+            dn = plots[j].z[1] - mean[i, 1] - dt * mean[i, 3]
+            if de * de + dn * dn < best:
+                best, out[i] = de * de + dn * dn, plots[j].t_s
+    return out
 
 
 @kernel

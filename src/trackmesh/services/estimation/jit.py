@@ -29,6 +29,11 @@ def kernel(function: F) -> F:
     return _compiled(function)
 
 
+def inlined(function: F) -> F:
+    """As ``kernel``, and compiled into each of its callers: there its arguments may be constants."""
+    return _compiled(function, forceinline=True)
+
+
 def parallel_kernel(function: F) -> F:
     """As ``kernel``, and the interpreter lock is released."""
     return _compiled(function, nogil=True)

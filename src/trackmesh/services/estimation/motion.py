@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from trackmesh.services.estimation.jit import kernel
+from trackmesh.services.estimation.jit import inlined, kernel
 from trackmesh.services.estimation.noise import add_along, add_white_acceleration, singer_noise, white_jerk
 
 FloatArray = npt.NDArray[np.float64]
@@ -50,14 +50,24 @@ class Model(NamedTuple):
 
 
 @kernel
-def predict_model(kind: int, numbers: FloatArray, x: FloatArray, P: FloatArray, dt_s: float, work: FloatArray) -> None:
+def predict_model(
+    kind: int,
+    numbers: FloatArray,
+    x: FloatArray,
+    P: FloatArray,
+    dt_s: float,
+    F: FloatArray,
+    product: FloatArray,
+    block: FloatArray,
+) -> None:
     """Predict a state (>= d,) and its covariance (>= d, >= d) in place over ``dt_s`` >= 0.
 
     Args:
         kind: of the model. numbers: (4,) its q, mean, sd, time_s.
         x, P: state and covariance, of which the first d = STATES[kind] components are used.
         dt_s: seconds.
-        work: (13, 6) scratch.
+        F: (6, 6), written by all kinds but random walk and constant velocity (see ``linear_flow``).
+        product, block: (6, 6), (6,) scratch.
     """
     if dt_s <= 0.0:
         return
@@ -67,11 +77,20 @@ def predict_model(kind: int, numbers: FloatArray, x: FloatArray, P: FloatArray, 
         P[0, 0] += numbers[0] * dt_s
         P[1, 1] += numbers[0] * dt_s
     elif kind == TURN:
-        _predict_turn(numbers, x, P, dt_s, work)
+        _predict_turn(numbers, x, P, dt_s, F, product, block)
     elif kind == TANGENTIAL:
-        _predict_tangential(numbers, x, P, dt_s, work)
+        _predict_tangential(numbers, x, P, dt_s, F, product, block)
     else:
-        _predict_acceleration(kind, numbers, x, P, dt_s, work)
+        _predict_acceleration(kind, numbers, x, P, dt_s, F, product, block)
+
+
+@kernel
+def linear_flow(kind: int, dt_s: float, F: FloatArray) -> None:
+    """Write F (>= 4, >= 4) of random walk and constant velocity; other kinds change nothing."""
+    if kind in (CONSTANT_VELOCITY, RANDOM_WALK):
+        _identity(F, 4)
+        if kind == CONSTANT_VELOCITY:
+            F[0, 2] = F[1, 3] = dt_s
 
 
 @kernel
@@ -173,44 +192,68 @@ def acceleration_matrix(kind: int, time_s: float, dt_s: float, F: FloatArray) ->
 
 
 @kernel
-def _predict_turn(numbers: FloatArray, x: FloatArray, P: FloatArray, dt_s: float, work: FloatArray) -> None:
-    speed, heading = math.hypot(x[2], x[3]), math.atan2(x[3], x[2]) + 0.5 * x[4] * dt_s
-    turn(x, numbers[1], numbers[3], dt_s, work)
-    _propagate(P, work, work[6:], 5)
-    block = work[12]
+def _predict_turn(
+    numbers: FloatArray,
+    x: FloatArray,
+    P: FloatArray,
+    dt_s: float,
+    F: FloatArray,
+    product: FloatArray,
+    block: FloatArray,
+) -> None:
+    speed = math.hypot(x[2], x[3])
+    east, north = (1.0, 0.0) if speed == 0.0 else (x[2] / speed, x[3] / speed)
+    half = 0.5 * x[4] * dt_s
+    cos, sin = math.cos(half), math.sin(half)
+    turn(x, numbers[1], numbers[3], dt_s, F)
+    _propagate(P, F, product, 5)
     singer_noise(numbers[2], numbers[3], dt_s, block)
-    # The turn rate acts across the velocity: |v| times it is an acceleration along the normal.
+    # The turn rate acts across the velocity at half time: |v| times it is an acceleration along the normal.
     block[0] *= speed * speed
     block[1] *= speed * speed
     block[3] *= speed * speed
     block[2] *= speed
     block[4] *= speed
-    add_along(P, block, -math.sin(heading), math.cos(heading), 4)
+    add_along(P, block, -(sin * east + cos * north), cos * east - sin * north, 4)
     add_white_acceleration(P, numbers[0], dt_s)
 
 
 @kernel
-def _predict_tangential(numbers: FloatArray, x: FloatArray, P: FloatArray, dt_s: float, work: FloatArray) -> None:
+def _predict_tangential(
+    numbers: FloatArray,
+    x: FloatArray,
+    P: FloatArray,
+    dt_s: float,
+    F: FloatArray,
+    product: FloatArray,
+    block: FloatArray,
+) -> None:
     speed = math.hypot(x[2], x[3])
     east, north = (1.0, 0.0) if speed == 0.0 else (x[2] / speed, x[3] / speed)
-    tangential(x, numbers[1], numbers[3], dt_s, work)
-    _propagate(P, work, work[6:], 5)
-    singer_noise(numbers[2], numbers[3], dt_s, work[12])
-    add_along(P, work[12], east, north, 4)
+    tangential(x, numbers[1], numbers[3], dt_s, F)
+    _propagate(P, F, product, 5)
+    singer_noise(numbers[2], numbers[3], dt_s, block)
+    add_along(P, block, east, north, 4)
     add_white_acceleration(P, numbers[0], dt_s)
 
 
 @kernel
 def _predict_acceleration(
-    kind: int, numbers: FloatArray, x: FloatArray, P: FloatArray, dt_s: float, work: FloatArray
+    kind: int,
+    numbers: FloatArray,
+    x: FloatArray,
+    P: FloatArray,
+    dt_s: float,
+    F: FloatArray,
+    product: FloatArray,
+    block: FloatArray,
 ) -> None:
-    acceleration_matrix(kind, numbers[3], dt_s, work)
+    acceleration_matrix(kind, numbers[3], dt_s, F)
     for i in range(2):
-        x[i] += work[i, i + 2] * x[i + 2] + work[i, i + 4] * x[i + 4]
-        x[i + 2] += work[i + 2, i + 4] * x[i + 4]
-        x[i + 4] *= work[i + 4, i + 4]
-    _propagate(P, work, work[6:], 6)
-    block = work[12]
+        x[i] += F[i, i + 2] * x[i + 2] + F[i, i + 4] * x[i + 4]
+        x[i + 2] += F[i + 2, i + 4] * x[i + 4]
+        x[i + 4] *= F[i + 4, i + 4]
+    _propagate(P, F, product, 6)
     if kind == SINGER:
         singer_noise(numbers[2], numbers[3], dt_s, block)
         add_white_acceleration(P, numbers[0], dt_s)
@@ -220,33 +263,29 @@ def _predict_acceleration(
     add_along(P, block, 0.0, 1.0, 5)
 
 
-@kernel
-def own_acceleration(kind: int, numbers: FloatArray, speed_mps: float) -> float:
-    """A bound of the acceleration that a model's own parameters can mean, at a speed: |mean| and two sigma of it."""
-    strength = abs(numbers[1]) + 2.0 * numbers[2]
-    return float(strength * speed_mps if kind == TURN else strength)
-
-
-@kernel
+@inlined
 def _identity(F: FloatArray, d: int) -> None:
     for i in range(d):
         for j in range(d):
             F[i, j] = 1.0 if i == j else 0.0
 
 
-@kernel
-def _propagate(P: FloatArray, F: FloatArray, work: FloatArray, d: int) -> None:
-    """P <- F P F^T for a symmetric P, written as one triangle and mirrored."""
+@inlined
+def _propagate(P: FloatArray, F: FloatArray, product: FloatArray, d: int) -> None:
+    """P <- F P F^T for a symmetric P, written as one triangle and mirrored.
+
+    Nothing is moved by its position: the first two columns of F are those of the identity.
+    """
     for i in range(d):
         for j in range(d):
-            value = 0.0
-            for k in range(d):
+            value = P[i, j] if i < 2 else 0.0
+            for k in range(2, d):
                 value += F[i, k] * P[k, j]
-            work[i, j] = value
+            product[i, j] = value
     for i in range(d):
         for j in range(i, d):
-            value = 0.0
-            for k in range(d):
-                value += work[i, k] * F[j, k]
+            value = product[i, j] if j < 2 else 0.0
+            for k in range(2, d):
+                value += product[i, k] * F[j, k]
             P[i, j] = value
             P[j, i] = value

@@ -49,19 +49,19 @@ def product_of_gaussians(x: FloatArray, P: FloatArray, out_x: FloatArray, out_P:
 
 
 @kernel
-def after_update(models: Models, s: State, i: int) -> None:
-    """Replace probabilities and next transition matrix of row ``i`` by the printed ones (its only branch)."""
+def after_update(models: Models, s: State) -> None:
+    """Replace probabilities and next transition matrix by the printed ones."""
     r = len(models.kind)
     mean, P = np.empty(_COMMON), np.empty((_COMMON, _COMMON))
-    product_of_gaussians(s.x[i], s.P[i], mean, P)
+    product_of_gaussians(s.x, s.P, mean, P)
     log_density = np.empty(r)
     for j in range(r):
-        log_density[j] = log_normal(s.x[i, j], mean, P)
-    normalise(log_density, s.mu[i])
+        log_density[j] = log_normal(s.x[j], mean, P)
+    normalise(log_density, s.mu)
     for a in range(r):
         for b in range(r):
-            log_density[b] = log_normal(s.x[i, a], s.x[i, b], s.P[i, b])
-        normalise(log_density, s.counts[i, a])
+            log_density[b] = log_normal(s.x[a], s.x[b], s.P[b])
+        normalise(log_density, s.counts[a])
 
 
 @kernel

@@ -11,13 +11,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from trackmesh.services.estimation.jit import kernel
+from trackmesh.services.estimation.jit import inlined, kernel
 
 FloatArray = npt.NDArray[np.float64]
 
-_SERIES_OF = 0.5
+_LARGEST_STEP = 1.0 / 16.0
 _MIXED = 1e15
-_SMALLEST_TERM = 1e-18
 
 
 def generator(sojourn_s: FloatArray, jumps: FloatArray | None = None) -> FloatArray:
@@ -50,53 +49,86 @@ def stationary(G: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(p, 0.0) / np.maximum(p, 0.0).sum())
 
 
-@kernel
-def transition_matrix(G: FloatArray, dt_s: float, out: FloatArray) -> None:
-    """Write Pi(dt) = expm(G dt) into ``out`` (r, r); rows sum to one, entries are not negative.
+def uniformised(G: FloatArray, size: int) -> tuple[FloatArray, float]:
+    """The chain of generator G as jumps of one rate: U = I + G / rate with rate = max -G_ii (Jensen 1953).
 
-    Uniformisation (Jensen 1953) and squaring: with g = max -G_ii, U = I + G/g and h = dt/2^m so short that g h <= 0.5,
-    expm(G h) ~ sum_k (g h)^k/k! U^k, of which nothing is negative; it needs no eigenvectors, which a chain may lack.
+    Returns:
+        U (size, size), whose rows are probabilities; states beyond those of G are never left. The rate, 1/s.
     """
-    r = len(G)
-    fastest = 0.0
+    rate = max(float(-np.diag(G).min()), 1e-300)
+    U = np.eye(size)
+    U[: len(G), : len(G)] += G / rate
+    return np.maximum(U, 0.0), rate
+
+
+@kernel
+def transition_matrix(U: FloatArray, rate: float, dt_s: float, out: FloatArray, powers: FloatArray) -> None:
+    """Write Pi(dt) = expm(G dt) of a uniformised chain into ``out`` (r, r); rows sum to one, nothing is negative.
+
+    With p = rate dt / 2^m <= 1/16, expm(G dt / 2^m) ~ sum_k p^k/k! U^k up to k = 8, the sum being grouped by powers of
+    U^3 (Paterson and Stockmeyer 1973), its rows normalised, then squared m times. The rest is below 1e-16.
+    It needs no eigenvectors, which a chain may lack.
+
+    Args:
+        U: (r, r). rate: 1/s. dt_s: >= 0.
+        powers: (3, r, r) scratch.
+    """
+    r = len(U)
+    p, halvings = min(rate * dt_s, _MIXED), 0
+    while p > _LARGEST_STEP:
+        p, halvings = 0.5 * p, halvings + 1
+    U2, U3, work = powers[0], powers[1], powers[2]
+    _multiply(U, U, U2)
+    _multiply(U2, U, U3)
+    c2 = p * p / 2.0
+    c3 = c2 * p / 3.0
+    c4 = c3 * p / 4.0
+    c5 = c4 * p / 5.0
+    c6 = c5 * p / 6.0
+    c7 = c6 * p / 7.0
+    c8 = c7 * p / 8.0
+    _combine(c6, c7, c8, U, U2, work)
+    _multiply(U3, work, out)
+    _combine(c3, c4, c5, U, U2, work)
     for i in range(r):
-        fastest = max(fastest, -G[i, i])
         for j in range(r):
-            out[i, j] = 1.0 if i == j else 0.0
-    if not (fastest > 0.0 and dt_s > 0.0):
-        return
-    power, halvings = min(fastest * dt_s, _MIXED), 0
-    while power > _SERIES_OF:
-        power, halvings = 0.5 * power, halvings + 1
-    term, product = np.empty((r, r)), np.empty((r, r))
-    term[:, :] = out
-    k, weight = 1, power
-    while weight > _SMALLEST_TERM:
-        for i in range(r):
-            for j in range(r):
-                value = term[i, j]
-                for a in range(r):
-                    value += term[i, a] * G[a, j] / fastest
-                product[i, j] = max(value, 0.0) * power / k
-        for i in range(r):
-            for j in range(r):
-                term[i, j] = product[i, j]
-                out[i, j] += product[i, j]
-        k += 1
-        weight *= power / k
+            work[i, j] += out[i, j]
+    _multiply(U3, work, out)
+    _combine(1.0, p, c2, U, U2, work)
+    for i in range(r):
+        for j in range(r):
+            out[i, j] += work[i, j]
     _normalise_rows(out)
     for _ in range(halvings):
+        _multiply(out, out, work)
         for i in range(r):
             for j in range(r):
-                value = 0.0
-                for a in range(r):
-                    value += out[i, a] * out[a, j]
-                product[i, j] = value
-        out[:, :] = product
+                out[i, j] = work[i, j]
         _normalise_rows(out)
 
 
-@kernel
+@inlined
+def _multiply(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
+    r = len(A)
+    for i in range(r):
+        for j in range(r):
+            value = 0.0
+            for k in range(r):
+                value += A[i, k] * B[k, j]
+            out[i, j] = value
+
+
+@inlined
+def _combine(a: float, b: float, c: float, U: FloatArray, U2: FloatArray, out: FloatArray) -> None:
+    """Write a I + b U + c U^2."""
+    r = len(U)
+    for i in range(r):
+        for j in range(r):
+            out[i, j] = b * U[i, j] + c * U2[i, j]
+        out[i, i] += a
+
+
+@inlined
 def _normalise_rows(matrix: FloatArray) -> None:
     for i in range(len(matrix)):
         total = 0.0

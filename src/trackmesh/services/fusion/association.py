@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from trackmesh.services.estimation import assignment, gating
+from trackmesh.services.estimation.gating import Mixture
 from trackmesh.services.estimation.lookup import index_of
 from trackmesh.services.estimation.pairs import (
     PairRules,
@@ -16,6 +17,7 @@ from trackmesh.services.estimation.pairs import (
     log_ratio,
     state_distances,
 )
+from trackmesh.services.estimation.plots import make_plots
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -87,9 +89,10 @@ class SequentialTest:
         near = np.empty(0, np.int64)
         if len(a.number) and len(b.number):
             R = np.stack([b.P[:, 0, 0], b.P[:, 0, 1], b.P[:, 1, 1]], axis=1)
-            ones, zeros = np.ones((len(a.number), 1)), np.zeros(len(a.number))
-            z, tz = np.ascontiguousarray(b.x[:, :2]), np.zeros(len(b.number))
-            i, j, _ = gating.gate(a.x[:, None], a.P[:, None], ones, zeros, z, R, tz, _CANDIDATE_GATE)
+            tracks = Mixture(
+                np.ascontiguousarray(a.x[:, None]), np.ascontiguousarray(a.P[:, None]), np.ones((len(a.number), 1))
+            )
+            i, j, _ = gating.gate(tracks, np.zeros(len(a.number)), make_plots(b.x[:, :2], R, 0.0), _CANDIDATE_GATE)
             near = (a.number[i] << 31) | b.number[j]
         key = np.union1d(near, self._pairs.key)
         ia, ib = index_of(a.number, key >> 31), index_of(b.number, key & NUMBER_MASK)

@@ -14,14 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from trackmesh.protocol.errors import RefusedMessage
-from trackmesh.protocol.messages import ENDED, Geodetic, PlotBatch, SensorInfo, TrackFrame, TrackQuery
-from trackmesh.services.estimation import tracks
-from trackmesh.services.estimation.bank import Models
+from trackmesh.protocol.messages import ENDED, Geodetic, PlotBatch, RefinedFrame, SensorInfo, TrackFrame, TrackQuery
 from trackmesh.services.estimation.lookup import index_of
 from trackmesh.services.estimation.pairs import PairRules, state_distances
+from trackmesh.services.estimation.plots import Plots
 from trackmesh.services.fusion import frames, life, membership
 from trackmesh.services.fusion.association import NUMBER_MASK, DeclaredPairs, LocalTracks, SequentialTest
-from trackmesh.services.fusion.layer import Layer, Look, Plots
+from trackmesh.services.fusion.layer import Layer, Look
 from trackmesh.services.fusion.life import Rules
 from trackmesh.services.fusion.sensors import Sensor
 from trackmesh.services.fusion.settings import EngineSettings
@@ -35,6 +34,7 @@ _JUDGED_SECTORS_LATE = 1.5
 _MERGE_GATE = 25.0
 _HITS_FOR_TEST = 3
 _TRACK_BITS = 41
+_ROWS = 64
 
 TRACK_EPOCH_MS = 1_577_836_800_000
 """2020-01-01 in Unix milliseconds: track numbers begin at the milliseconds since then, so no restart repeats one."""
@@ -59,6 +59,8 @@ class FusionEngine:
     Attributes:
         counters: what happened, by name (``plots``, ``late_plots``, ``merged``, ``contradictions``, ...).
         sensors: by id, in the order in which they were first heard of.
+        log_likelihood: of all plots so far under the picture, against clutter alone: the plots that tracks took by
+            their predicted density over that of clutter (the declared one, else the running estimate), and the misses.
     """
 
     def __init__(self, settings: EngineSettings, unit: Unit, origin: Geodetic | None = None) -> None:
@@ -67,9 +69,10 @@ class FusionEngine:
         self.origin = origin
         self.counters: Counter[str] = Counter()
         self.sensors: dict[str, Sensor] = {}
-        self._models = settings.models()
-        self._local_models = settings.local_models()
-        self._system = self._layer(self._models, self._rules(1.0, settings.coast_s), settings.ring_system)
+        self.log_likelihood = 0.0
+        self._models = settings.model_names()
+        self._manoeuvre_models = settings.manoeuvre_models()
+        self._system = Layer(settings.system_tracks(_ROWS), self._rules(1.0, settings.coast_s), 1, settings.gate)
         self._locals: list[Layer] = []
         self._tests: dict[tuple[int, int], SequentialTest] = {}
         self._pair_rules = PairRules(speed_mps=settings.pair_speed_mps, radius_m=settings.pair_radius_m)
@@ -81,6 +84,7 @@ class FusionEngine:
         self._cycle_s = -np.inf
         self._frame_s = -np.inf
         self._ended: list[TrackFrame] = []
+        self._refined_s = np.empty(0)
 
     @property
     def now_ns(self) -> int | None:
@@ -103,7 +107,7 @@ class FusionEngine:
         rules = self._rules(info.period_s, self.settings.local_coast_periods * info.period_s)
         if old is None:
             self._system.add_sensors(len(self.sensors))
-            self._locals.append(self._layer(self._local_models, rules, self.settings.ring_local))
+            self._locals.append(Layer(self.settings.local_tracks(_ROWS), rules, 1, self.settings.gate))
             for other in range(sensor.index):
                 self._tests[other, sensor.index] = SequentialTest(self._pair_rules)
         else:
@@ -119,8 +123,7 @@ class FusionEngine:
         if sensor is None:
             raise RefusedMessage("unknown_sensor", f"Nothing is known of sensor {batch.sensor_id} yet.")
         if len(batch.t_ns):
-            z, R = sensor.plane(batch)
-            self._take(sensor, batch, z, R)
+            self._take(sensor, batch, sensor.plots(batch, self._to_s_array(batch.t_ns)))
         return self._due_frame(self.settings.frame_period_s)
 
     def tick(self, t_ns: int) -> TrackFrame | None:
@@ -146,6 +149,38 @@ class FusionEngine:
             t_s = (query.at_t_ns - self._epoch_ns) / 1e9
         return frames.select(self._picture(t_s, tentative), query)
 
+    def refined(self) -> RefinedFrame | None:
+        """States of ``settings.lag`` plots ago, refined by those since, of the tracks that moved on since then.
+
+        None where there are none, or no lag is kept.
+        """
+        if not self.settings.lag or self._epoch_ns is None:
+            return None
+        rows = self._system.rows
+        rows = rows[self._system.life.confirmed[rows]]
+        x, P, t_s = self._system.refined(rows, self.settings.lag)
+        told = np.full(len(self._system.life.uid), -np.inf)
+        told[: len(self._refined_s)] = self._refined_s
+        fresh = (t_s != told[rows]) & (self._system.life.hits[rows] > self.settings.lag)
+        if not fresh.any():
+            return None
+        rows = rows[fresh]
+        told[rows] = t_s[fresh]
+        self._refined_s = told
+        state, covariance = frames.pack_states(x[fresh], P[fresh])
+        return RefinedFrame.model_construct(
+            schema_version=1,
+            unit_id=self.unit.unit_id,
+            boot_id=self.unit.boot_id,
+            seq=self._seq,
+            t_ns=self._to_ns(self._now_s),
+            lag=self.settings.lag,
+            track_id=self._system.life.link[rows].copy(),
+            state_t_ns=self._to_ns_array(t_s[fresh]),
+            state=state,
+            covariance=covariance,
+        )
+
     def figures(self) -> dict[str, float]:
         """Present values for the status: tracks, local tracks, pairs under the sequential test."""
         rows = self._system.rows
@@ -156,17 +191,16 @@ class FusionEngine:
 
     # --- one batch ---
 
-    def _take(self, sensor: Sensor, batch: PlotBatch, z: npt.NDArray[np.float64], R: npt.NDArray[np.float64]) -> None:
-        t_s = self._to_s_array(batch.t_ns)
-        self._advance(float(t_s.max()))
-        fresh = t_s >= self._now_s - self.settings.max_lateness_s
-        self.counters["plots"] += len(t_s)
-        self.counters["too_late_plots"] += int(len(t_s) - fresh.sum())
+    def _take(self, sensor: Sensor, batch: PlotBatch, plots: Plots) -> None:
+        self._advance(float(plots["t_s"].max()))
+        fresh = plots["t_s"] >= self._now_s - self.settings.max_lateness_s
+        self.counters["plots"] += len(plots)
+        self.counters["too_late_plots"] += int(len(plots) - fresh.sum())
         if not fresh.any():
             return
-        plots = Plots(np.ascontiguousarray(z[fresh]), np.ascontiguousarray(R[fresh]), t_s[fresh])
+        plots = plots[fresh]
         sectors = batch.scan.sectors if batch.scan else 1
-        n, share = len(plots.t_s), 1.0 / sectors
+        n, share = len(plots), 1.0 / sectors
         local = self._locals[sensor.index]
         density = sensor.local_clutter.value(n, share)
         got = local.step(plots, self._look(sensor, 0, plots, sectors, density), self._now_s)
@@ -174,7 +208,9 @@ class FusionEngine:
         density = sensor.system_clutter.value(n, share)
         fed = self._system.step(plots, self._look(sensor, sensor.index, plots, sectors, density), self._now_s)
         sensor.system_clutter.add(n - int(fed.by_confirmed.sum()), share)
+        self.log_likelihood += fed.log_likelihood
         self.counters["late_plots"] += fed.late
+        self.counters["repairs"] = self._system.filters.repairs + sum(one.filters.repairs for one in self._locals)
         life.share(local.life, got.row, self._system.life.uid[fed.row])
         self._name(fed.confirmed)
         self._note_ended(fed.ended)
@@ -184,7 +220,7 @@ class FusionEngine:
         info = sensor.info
         return Look(
             sensor=index,
-            t_s=float(plots.t_s.max()),
+            t_s=float(plots["t_s"].max()),
             site=sensor.site,
             max_range_m=info.max_range_m,
             period_s=info.period_s,
@@ -193,6 +229,7 @@ class FusionEngine:
             margin_s=_JUDGED_SECTORS_LATE * info.period_s / sectors,
             lately_s=np.inf if info.kind == "radar" else _SEEN_LATELY_PERIODS * info.period_s,
             clutter_density=density,
+            reference_density=info.clutter_density or density,
         )
 
     def _name(self, rows: IntArray) -> None:
@@ -222,7 +259,7 @@ class FusionEngine:
     def _local_tracks(self, local: Layer) -> LocalTracks:
         rows = local.rows
         rows = rows[local.life.hits[rows] >= _HITS_FOR_TEST]
-        x, P, _ = local.predict(rows, np.maximum(local.filters.head.t_s[rows], self._now_s))
+        x, P, _ = local.predict(rows, np.maximum(local.filters.t_s[rows], self._now_s))
         return LocalTracks(local.life.uid[rows] & NUMBER_MASK, x, P)
 
     def _join(self, a: int, b: int, number_a: IntArray, number_b: IntArray, pairs: DeclaredPairs) -> None:
@@ -247,7 +284,7 @@ class FusionEngine:
         if not (known.alive[one] and known.alive[other]):
             return
         pair = np.array([one, other])
-        x, P, _ = self._system.predict(pair, np.maximum(self._system.filters.head.t_s[pair], self._now_s))
+        x, P, _ = self._system.predict(pair, np.maximum(self._system.filters.t_s[pair], self._now_s))
         zero, first = np.zeros(1, np.int64), np.ones(1, np.int64)
         distance, _ = state_distances(x, P, x, P, zero, first)
         both = ((known.member[one] >= 0) & (known.member[other] >= 0)).any()
@@ -255,7 +292,7 @@ class FusionEngine:
             self.counters["contradictions"] += 1
             return
         old, young = sorted((one, other), key=lambda row: int(known.link[row]))
-        tracks.feed_ring(self._models, self._system.filters, young, old)
+        self._system.filters.feed_from(young, old)
         free = known.member[old] < 0
         known.member[old][free] = known.member[young][free]
         known.last_s[old] = max(known.last_s[old], known.last_s[young])
@@ -281,7 +318,7 @@ class FusionEngine:
         rows = self._system.rows
         if not tentative:
             rows = rows[self._system.life.confirmed[rows]]
-        rows = rows[self._system.filters.lag.t_s[rows] <= t_s]
+        rows = rows[self._system.filters.oldest_s[rows] <= t_s]
         frame = self._frame_of(rows, t_s, self._seq if seq is None else seq)
         return frames.join(frame, ended) if ended else frame
 
@@ -305,7 +342,8 @@ class FusionEngine:
             height_m=None,
             height_variance_m2=None,
             model_probability=mu,
-            models=self.settings.model_names(),
+            models=self._models,
+            manoeuvre_fit=frames.manoeuvre_fit(mu, self._manoeuvre_models),
             sensors=list(self.sensors),
             members=known.member[rows][:, : len(self.sensors)].copy(),
             updated_t_ns=self._to_ns_array(known.last_s[rows]),
@@ -350,10 +388,6 @@ class FusionEngine:
     def _tentative_id(self, rows: IntArray) -> IntArray:
         # Tentative tracks have no public number yet; theirs is of a range that confirmed ones never reach.
         return (self.unit.number << _TRACK_BITS) | (1 << (_TRACK_BITS - 1)) | self._system.life.uid[rows]
-
-    def _layer(self, models: Models, rules: Rules, ring: int) -> Layer:
-        s = self.settings
-        return Layer(models, rules, ring, 1, s.gate, s.sigma_velocity_mps)
 
     def _rules(self, period_s: float, coast_s: float) -> Rules:
         s = self.settings

@@ -33,6 +33,12 @@ def status_of(layer: Layer, rows: IntArray, t_s: float, coasting_after_s: float)
     return status.astype(np.uint8)
 
 
+def manoeuvre_fit(mu: FloatArray, models: int) -> FloatArray | None:
+    """Probability (n,) of the first ``models`` of all (n, r); None where there are none of that kind."""
+    # A sum of probabilities may be one and a bit in the last place, which no client would accept.
+    return np.minimum(mu[:, :models].sum(axis=1), 1.0) if models else None
+
+
 def select(frame: TrackFrame, query: TrackQuery) -> TrackFrame:
     """The part of a frame that a query asks for.
 
@@ -62,6 +68,7 @@ _PER_TRACK = (
     "state",
     "covariance",
     "model_probability",
+    "manoeuvre_fit",
     "members",
     "updated_t_ns",
     "first_t_ns",
@@ -74,9 +81,13 @@ def join(frame: TrackFrame, others: list[TrackFrame]) -> TrackFrame:
     return frame.model_copy(
         update={
             name: np.concatenate([_widened(getattr(f, name), name, sensors) for f in (frame, *others)])
-            for name in _PER_TRACK
+            for name in _given(frame)
         }
     )
+
+
+def _given(frame: TrackFrame) -> list[str]:
+    return [name for name in _PER_TRACK if getattr(frame, name) is not None]
 
 
 def _widened(values: npt.NDArray[np.generic], name: str, sensors: int) -> npt.NDArray[np.generic]:
@@ -88,7 +99,7 @@ def _widened(values: npt.NDArray[np.generic], name: str, sensors: int) -> npt.ND
 
 def take(frame: TrackFrame, keep: npt.NDArray[np.bool_]) -> TrackFrame:
     """The frame with only these tracks."""
-    return frame.model_copy(update={name: np.ascontiguousarray(getattr(frame, name)[keep]) for name in _PER_TRACK})
+    return frame.model_copy(update={name: np.ascontiguousarray(getattr(frame, name)[keep]) for name in _given(frame)})
 
 
 def geodetic(position_m: FloatArray, origin: Geodetic | None) -> tuple[FloatArray, FloatArray]:

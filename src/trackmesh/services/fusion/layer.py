@@ -5,31 +5,46 @@ The same code keeps the local tracks of one sensor and the system tracks of all 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from trackmesh.services.estimation import assignment, gating, tracks
-from trackmesh.services.estimation.bank import Models, State, make_state
-from trackmesh.services.estimation.tracks import Filters, join_rows, make_filters
+from trackmesh.services.estimation import assignment, gating
+from trackmesh.services.estimation.gating import Mixture
+from trackmesh.services.estimation.plots import Plots
 from trackmesh.services.fusion import life as lives
 from trackmesh.services.fusion.life import Life, Rules, make_life
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 _SCORE_AT_ZERO = 60.0
 _CONFIRMED_FIRST = 200.0
 _LEAST_SCORE = 0.01
 
 
-class Plots(NamedTuple):
-    """Plots in the plane: z (m, 2) metres east and north, R (m, 3) covariance [ee, en, nn], t_s (m,)."""
+class TrackFilters(Protocol):
+    """The filters of a layer, one a row: ``ImmTracks`` or ``AlphaBetaTracks``, whose methods tell more."""
 
-    z: FloatArray
-    R: FloatArray
-    t_s: FloatArray
+    @property
+    def t_s(self) -> FloatArray: ...  # noqa: D102
+    @property
+    def oldest_s(self) -> FloatArray: ...  # noqa: D102
+    @property
+    def mean(self) -> FloatArray: ...  # noqa: D102
+    @property
+    def repairs(self) -> int: ...  # noqa: D102
+
+    def begin(self, rows: IntArray, plots: Plots) -> None: ...  # noqa: D102
+    def feed(self, rows: IntArray, plots: Plots) -> BoolArray: ...  # noqa: D102
+    def feed_from(self, source: int, target: int) -> None: ...  # noqa: D102
+    def near(self, rows: IntArray, plots: Plots, limit: float) -> IntArray: ...  # noqa: D102
+    def predict(self, rows: IntArray, t_s: FloatArray) -> tuple[Mixture, BoolArray]: ...  # noqa: D102
+    def estimates(self, mixture: Mixture) -> tuple[FloatArray, FloatArray]: ...  # noqa: D102
+    def refined(self, rows: IntArray, lag: int) -> tuple[Mixture, FloatArray]: ...  # noqa: D102
+    def grow(self, rows: int) -> None: ...  # noqa: D102
 
 
 class Look(NamedTuple):
@@ -43,7 +58,8 @@ class Look(NamedTuple):
         margin_s: how long after its period a sector look is judged.
         lately_s: a sensor without coverage counts misses only where it saw the track within this time; infinite for a
             radar, whose coverage is its range.
-        clutter_density: false plots a look and square metre.
+        clutter_density: false plots a look and square metre, as estimated now.
+        reference_density: the density that the log-likelihood of the picture is measured against.
     """
 
     sensor: int
@@ -56,6 +72,7 @@ class Look(NamedTuple):
     margin_s: float
     lately_s: float
     clutter_density: float
+    reference_density: float
 
 
 class Step(NamedTuple):
@@ -67,28 +84,26 @@ class Step(NamedTuple):
         confirmed: rows newly confirmed.
         ended: (row, uid, link) of the confirmed tracks that ended.
         late: plots that came too late for the filter of their track.
+        log_likelihood: what the look adds to that of the picture against clutter alone.
     """
 
     row: IntArray
-    by_confirmed: npt.NDArray[np.bool_]
+    by_confirmed: BoolArray
     confirmed: IntArray
     ended: list[tuple[int, int, int]]
     late: int
+    log_likelihood: float
 
 
 class Layer:
     """A bank of tracks; rows never move while their track lives, uids are never used twice."""
 
-    def __init__(
-        self, models: Models, rules: Rules, ring: int, sensors: int, gate: float, sigma_v_mps: float, rows: int = 64
-    ) -> None:
-        self.models = models
+    def __init__(self, filters: TrackFilters, rules: Rules, sensors: int, gate: float) -> None:
+        self.filters = filters
         self.rules = rules
         self.gate = gate
-        self.sigma_v_mps = sigma_v_mps
-        self._ring = ring
         self._next_uid = 0
-        self.filters: Filters = make_filters(models, rows, ring)
+        rows = len(filters.t_s)
         self.life: Life = make_life(rows, sensors)
         self._free = list(range(rows - 1, -1, -1))
 
@@ -103,22 +118,27 @@ class Layer:
         ``now_s`` is the time at which tracks are judged; with late plots it is after ``look.t_s``.
         """
         alive = self.rows
-        row = np.full(len(plots.t_s), -1, np.int64)
+        row = np.full(len(plots), -1, np.int64)
         by_confirmed = np.zeros(len(row), np.bool_)
-        late = 0
+        late, gained = 0, 0.0
         if len(row):
             if len(alive):
-                late = self._associate(alive, plots, look, row, by_confirmed)
+                late, gained = self._associate(alive, plots, look, row, by_confirmed)
             self._start(plots, look, row)
-        self._miss(alive, look)
+        lost = self._miss(alive, look)
         confirmed, ended = self.judge(now_s)
-        return Step(row, by_confirmed, confirmed, ended, late)
+        return Step(row, by_confirmed, confirmed, ended, late, gained + lost)
 
     def predict(self, rows: IntArray, t_s: float | FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Moment-matched states (m, 4), covariances (m, 4, 4) and model probabilities (m, r) of rows at their times."""
-        state, mu, _ = self._predict(rows, np.broadcast_to(np.asarray(t_s, float), len(rows)))
-        mean, covariance = tracks.estimates(self.models, state.x, state.P, mu)
-        return mean, covariance, mu
+        times = np.ascontiguousarray(np.broadcast_to(np.asarray(t_s, float), len(rows)))
+        mixture, _ = self.filters.predict(rows, times)
+        return *self.filters.estimates(mixture), mixture.mu
+
+    def refined(self, rows: IntArray, lag: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """States (m, 4) and covariances (m, 4, 4) of rows ``lag`` plots ago, and their times (m,)."""
+        mixture, t_s = self.filters.refined(rows, lag)
+        return *self.filters.estimates(mixture), t_s
 
     def judge(self, t_s: float) -> tuple[IntArray, list[tuple[int, int, int]]]:
         """Confirm, drop and end tracks at a time; returns rows newly confirmed, and (row, uid, link) of those ended."""
@@ -145,38 +165,38 @@ class Layer:
             self.life = self.life._replace(seen_s=more.seen_s, looked_s=more.looked_s, member=more.member)
 
     def _associate(
-        self, alive: IntArray, plots: Plots, look: Look, row: IntArray, by_confirmed: npt.NDArray[np.bool_]
-    ) -> int:
-        near = tracks.near(self.models, self.filters, alive, plots.z, plots.R, plots.t_s, self.gate)
+        self, alive: IntArray, plots: Plots, look: Look, row: IntArray, by_confirmed: BoolArray
+    ) -> tuple[int, float]:
+        near = self.filters.near(alive, plots, self.gate)
         if not len(near):
-            return 0
+            return 0, 0.0
         times = self._times(near, plots)
-        state, mu, known = self._predict(near, times)
-        x, P = state.x, state.P
+        mixture, known = self.filters.predict(near, times)
         if not known.all():
-            near, times, x, P, mu = near[known], times[known], x[known], P[known], mu[known]
-        i, j, cost = gating.gate(x, P, mu, times, plots.z, plots.R, plots.t_s, self.gate)
+            near, times, mixture = near[known], times[known], Mixture(*(part[known] for part in mixture))
+        i, j, cost = gating.gate(mixture, times, plots, self.gate)
         if not len(i):
-            return 0
+            return 0, 0.0
         confirmed = self.life.confirmed[near]
         score = np.maximum(_SCORE_AT_ZERO - cost, _LEAST_SCORE) + _CONFIRMED_FIRST * confirmed[i]
         chosen = assignment.assign(i, j, score, len(near), len(row))
         taken = np.flatnonzero(chosen >= 0)
         rows = near[chosen[taken]]
-        z, R, t_s = plots.z[taken], plots.R[taken], plots.t_s[taken]
-        fed = tracks.feed(self.models, self.filters, rows, z, R, t_s, look.sensor)
+        fed = self.filters.feed(rows, plots[taken])
         gain = self._gain(i, j, cost, chosen, look)
+        t_s = np.ascontiguousarray(plots["t_s"][taken])
         lives.hit(self.life, self.rules, rows[fed], t_s[fed], gain[fed], look.sensor)
         row[taken] = rows
         by_confirmed[taken] = confirmed[chosen[taken]]
-        return int(len(fed) - fed.sum())
+        gained = gain[fed].sum() + fed.sum() * np.log(look.clutter_density / look.reference_density)
+        return int(len(fed) - fed.sum()), float(gained)
 
     def _times(self, rows: IntArray, plots: Plots) -> FloatArray:
         """When the sensor looked at each row: the time of the plot nearest to it in the plane."""
-        t = plots.t_s
+        t = plots["t_s"]
         if (t == t[0]).all():
             return np.full(len(rows), t[0])
-        return tracks.nearest_times(self.filters, rows, plots.z, t)
+        return gating.nearest_times(self.filters.mean[rows], self.filters.t_s[rows], plots)
 
     def _gain(self, i: IntArray, j: IntArray, cost: FloatArray, chosen: IntArray, look: Look) -> FloatArray:
         """Log-likelihood ratio of each chosen pair, in order of plots: ln(Pd / (2 pi lambda)) - cost / 2."""
@@ -189,23 +209,19 @@ class Layer:
         if not len(unused):
             return
         rows = self._take(len(unused))
-        z, R, t_s = plots.z[unused], plots.R[unused], plots.t_s[unused]
-        tracks.begin(self.models, self.filters, rows, z, R, t_s, self.sigma_v_mps)
+        self.filters.begin(rows, plots[unused])
+        t_s = np.ascontiguousarray(plots["t_s"][unused])
         lives.born(self.life, rows, self._next_uid, t_s, look.sensor)
         self._next_uid += len(rows)
         row[unused] = rows
 
-    def _miss(self, rows: IntArray, look: Look) -> None:
-        log_miss = np.log(max(1.0 - look.p_detect, 1e-3))
-        lives.miss(
-            self.life, rows, self.filters.mean, self.filters.head.t_s, look.t_s, look.sensor, look.site,
+    def _miss(self, rows: IntArray, look: Look) -> float:
+        log_miss = float(np.log(max(1.0 - look.p_detect, 1e-3)))
+        missed = lives.miss(
+            self.life, rows, self.filters.mean, self.filters.t_s, look.t_s, look.sensor, look.site,
             look.max_range_m, look.lately_s, look.period_s, look.margin_s, look.whole, log_miss,
         )  # fmt: skip
-
-    def _predict(self, rows: IntArray, t_s: FloatArray) -> tuple[State, FloatArray, npt.NDArray[np.bool_]]:
-        state, mu = make_state(self.models, len(rows)), np.zeros((len(rows), len(self.models.kind)))
-        known = tracks.predict(self.models, self.filters, rows, np.ascontiguousarray(t_s), state, mu)
-        return state, mu, known
+        return missed * log_miss
 
     def _take(self, n: int) -> IntArray:
         while len(self._free) < n:
@@ -216,8 +232,7 @@ class Layer:
 
     def _grow(self) -> None:
         have = len(self.life.uid)
-        more_filters = make_filters(self.models, have, self._ring)
+        self.filters.grow(have)
         more_life = make_life(have, self.life.seen_s.shape[1])
-        self.filters = join_rows(self.filters, more_filters)
         self.life = Life(*(np.concatenate(pair) for pair in zip(self.life, more_life, strict=True)))
         self._free = list(range(2 * have - 1, have - 1, -1)) + self._free

@@ -143,7 +143,7 @@ def miss(
     margin_s: float,
     whole: bool,
     log_miss: float,
-) -> None:
+) -> int:
     """Judge the looks of ``sensor`` up to time ``t_s`` at rows that it can see and that took no plot of it.
 
     A radar (``lately_s`` infinite) sees what is within ``max_range_m`` of its ``site``; any other sensor sees what it
@@ -153,7 +153,11 @@ def miss(
 
     Args:
         mean, t_state_s: (all rows, 4), (all rows,) mean states and their times, to extrapolate.
+
+    Returns:
+        how many missed.
     """
+    missed = 0
     for i in rows:
         since = t_s - life.looked_s[i, sensor]
         due = since > 0.5 * period_s if whole else since > period_s + margin_s
@@ -170,6 +174,8 @@ def miss(
         if visible:
             life.misses[i] += 1
             life.score[i] += log_miss
+            missed += 1
+    return missed
 
 
 @kernel

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from pydantic import ValidationError
 
 from trackmesh.protocol.errors import RefusedMessage, TrackmeshError
 from trackmesh.protocol.files import Tick, UnitRecord
-from trackmesh.protocol.messages import Geodetic, Message, PlotBatch, SensorInfo, TrackFrame
+from trackmesh.protocol.messages import Geodetic, Message, PlotBatch, RefinedFrame, SensorInfo, TrackFrame
 from trackmesh.services.fusion.engine import FusionEngine, Unit
 from trackmesh.services.fusion.intake import Intake
 from trackmesh.services.fusion.settings import EngineSettings
@@ -21,6 +21,7 @@ class OfflineRun:
     A black box names unit and settings itself; any other recording is tracked by ``settings``.
 
     Attributes:
+        on_refined: given the refined states of every frame, where the settings keep a lag.
         refused: batches refused, by reason.
         plots: plots taken.
     """
@@ -37,6 +38,7 @@ class OfflineRun:
         self._origin = origin
         self._intake = Intake(0, 0)
         self.engine: FusionEngine | None = None
+        self.on_refined: Callable[[RefinedFrame], None] | None = None
         self.refused: Counter[str] = Counter()
         self.plots = 0
 
@@ -50,6 +52,12 @@ class OfflineRun:
             frame = self._take(record)
             if frame is not None:
                 yield frame
+                self._tell_refined()
+
+    def _tell_refined(self) -> None:
+        refined = self._running().refined() if self.on_refined else None
+        if self.on_refined and refined is not None:
+            self.on_refined(refined)
 
     def _take(self, record: Message) -> TrackFrame | None:
         if isinstance(record, UnitRecord):

@@ -9,6 +9,7 @@ import pymap3d
 from trackmesh.protocol.errors import RefusedMessage
 from trackmesh.protocol.messages import Geodetic, PlotBatch, SensorInfo
 from trackmesh.services.estimation.convert import polar_to_plane
+from trackmesh.services.estimation.plots import Plots, make_plots
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -62,6 +63,30 @@ class Sensor:
         """Place the sensor in the plane of this origin, which may be known only after the sensor."""
         self.site, self._turn = _place(self.info, origin)
         self._origin = origin
+
+    def plots(self, batch: PlotBatch, t_s: FloatArray) -> Plots:
+        """The plots of a batch in the system plane, at times (n,) of the engine.
+
+        A range rate is taken where its variance is known.
+
+        Raises:
+            RefusedMessage: the batch cannot be placed: no variances, no site, no origin.
+        """
+        z, R = self.plane(batch)
+        plots = make_plots(z, R, t_s, self.index)
+        if "range_rate_mps" in batch.columns:
+            column = batch.columns.index("range_rate_mps")
+            plots["range_rate_mps"] = batch.values[:, column]
+            plots["range_rate_variance"] = self._range_rate_variance(batch, column)
+            plots["site"] = self.site
+            if "elevation_rad" in batch.columns:
+                plots["level"] = np.cos(batch.values[:, batch.columns.index("elevation_rad")])
+        return plots
+
+    def _range_rate_variance(self, batch: PlotBatch, column: int) -> FloatArray | float:
+        if batch.variances is not None:
+            return batch.variances[:, column]
+        return float(self.info.sigma.get("range_rate_mps", np.inf)) ** 2
 
     def plane(self, batch: PlotBatch) -> tuple[FloatArray, FloatArray]:
         """Positions (n, 2) and covariances (n, 3) of a batch in the system plane.

@@ -59,8 +59,10 @@ class FusionService:
         warm_up(self.settings.engine)
         runtime.log.info("kernels ready after %.1f s", time.monotonic() - started)
         self._frames = runtime.bus.publisher(keys.tracks(self.unit.unit_id), history=_FRAMES_KEPT)
+        self._refined = runtime.bus.publisher(keys.refined(self.unit.unit_id), history=_FRAMES_KEPT)
         # The engine's thread may publish until it has ended.
         runtime.on_exit(self._frames.close)
+        runtime.on_exit(self._refined.close)
         self._tokens = runtime.closing(runtime.bus.watch_alive(keys.live("*", "*")))
         self._infos = runtime.closing(runtime.bus.subscribe(keys.sensor("*"), history=True))
         self._plots = runtime.closing(runtime.bus.subscribe(keys.plots("*"), history=True, capacity=_PLOTS_WAITING))
@@ -185,6 +187,10 @@ class FusionService:
         if frame is not None:
             self._frames.put(encode(frame), encoding(frame))
             self.runtime.counters.count("frames")
+            # Only this thread changes the engine.
+            refined = self.engine.refined()
+            if refined is not None:
+                self._refined.put(encode(refined), encoding(refined))
 
     def _record(self, record: SensorInfo | PlotBatch | Tick) -> None:
         if self._black_box is None:

@@ -10,8 +10,11 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from trackmesh.protocol.messages import Geodetic
 from trackmesh.protocol.messages.base import NonNegative, Positive
-from trackmesh.services.estimation.bank import Branch, Models, make_models
+from trackmesh.services.estimation.alpha_beta_tracks import AlphaBetaTracks
+from trackmesh.services.estimation.bank import Branch, make_models
 from trackmesh.services.estimation.filters import FilterName, generic_models, manoeuvre_models, velocity_models
+from trackmesh.services.estimation.tracks import ImmTracks
+from trackmesh.services.fusion.layer import TrackFilters
 from trackmesh.services.runtime import ServiceSettings
 
 
@@ -38,6 +41,10 @@ class EngineSettings(BaseModel):
     manoeuvre_s: Positive = Field(18.0, description="tvimm: typical length of a manoeuvre")
     quiet_s: Positive = Field(45.0, description="tvimm: typical time between manoeuvres")
     q_quiet: Positive = Field(0.3, description="tvimm: acceleration noise of quiet flight, m/s^1.5")
+    alpha_beta_acceleration_mps2: Positive = Field(5.0, description="alpha-beta: random acceleration, one sigma")
+    lag: Annotated[int, Field(ge=0, le=4)] = Field(
+        0, description="publish, beside the picture, states refined by this many later plots"
+    )
     sigma_velocity_mps: Positive = Field(150.0, description="velocity of a new track, one sigma per axis")
     gate: Positive = Field(16.0, description="largest squared Mahalanobis distance of a plot to a track's model")
     confirm_score: Positive = Field(12.0, description="log-likelihood ratio that confirms a track")
@@ -59,30 +66,42 @@ class EngineSettings(BaseModel):
     publish_tentative: bool = False
 
     @model_validator(mode="after")
-    def _same_models(self) -> Self:
+    def _consistent(self) -> Self:
         if len(self.q_m2ps3) != len(self.sojourn_s):
             raise ValueError("q_m2ps3 and sojourn_s must be equally long")
+        if self.lag and self.filter in ("alpha-beta", "tvimm-paper"):
+            raise ValueError(f"the filter {self.filter} keeps no lag: choose lag = 0 or another filter")
         return self
 
-    def models(self) -> Models:
-        """The models of the system tracks."""
-        return self._models(self.filter)
+    def system_tracks(self, rows: int) -> TrackFilters:
+        """Filters for the system tracks."""
+        return self._tracks(self.filter, rows, self.ring_system, self.lag)
 
-    def local_models(self) -> Models:
-        """The models of the local tracks."""
-        return self._models(self.local_filter)
+    def local_tracks(self, rows: int) -> TrackFilters:
+        """Filters for the local tracks of one sensor."""
+        return self._tracks(self.local_filter, rows, self.ring_local, 0)
 
     def model_names(self) -> list[str]:
         """Names of the models in a frame."""
+        if self.filter == "alpha-beta":
+            return ["alpha-beta"]
         return [model.name for branch in self._branches(self.filter) for model in branch.models]
 
-    def _models(self, name: str) -> Models:
-        return make_models(
+    def manoeuvre_models(self) -> int:
+        """How many of the models, from the first, are of the branch whose weight says that manoeuvres are modelled."""
+        return len(self._branches(self.filter)[0].models) if self.filter == "tvimm" else 0
+
+    def _tracks(self, name: str, rows: int, ring: int, lags: int) -> TrackFilters:
+        if name == "alpha-beta":
+            return AlphaBetaTracks(rows, self.sigma_velocity_mps, self.alpha_beta_acceleration_mps2)
+        models = make_models(
             self._branches(name),
             memory_s=self.tpm_memory_s,
             reference_s=self.tpm_reference_s,
             printed=name == "tvimm-paper",
+            lags=lags,
         )
+        return ImmTracks(models, rows, ring, self.sigma_velocity_mps)
 
     def _branches(self, name: str) -> tuple[Branch, ...]:
         if name == "tvimm":

@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from trackmesh.protocol.errors import TrackmeshError
-from trackmesh.sim.drawing import GRID, INK, MUTED, PAPER, TRACKS, TRUTH
+from trackmesh.sim.drawing import INK, PAPER, TRACKS, TRUTH
+from trackmesh.sim.studies.charts import dress, figure_title, log_ticks, new_figure, save, title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
-    from matplotlib.figure import Figure
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -46,7 +44,7 @@ def draw_k_end(folder: Path, index: FloatArray, best: FloatArray, rule: FloatArr
     Raises:
         TrackmeshError: matplotlib is missing, or the picture cannot be written.
     """
-    figure = _figure((11.0, 6.8))
+    figure = new_figure((11.0, 6.8))
     axes = figure.subplots()
     axes.set(xscale="log", yscale="log", xlim=(index[0], index[-1]), ylim=(1.8, 70.0))
     label = "at most 5 % more error"
@@ -56,15 +54,14 @@ def draw_k_end(folder: Path, index: FloatArray, best: FloatArray, rule: FloatArr
         index, rule, where="mid", color=INK, lw=1.1, ls=(0, (4, 2)), label="rule: decreasing gains meet the steady ones"
     )
     _draw_printed(axes, printed)
-    _ticks(axes.yaxis, _K_END_TICKS)
-    _ticks(axes.xaxis, (0.01, 0.1, 1, 10))
-    _dress(axes)
+    log_ticks(axes.yaxis, _K_END_TICKS)
+    log_ticks(axes.xaxis, (0.01, 0.1, 1, 10))
+    dress(axes)
     axes.set_xlabel(r"manoeuvring index  $\lambda = T^2 \sigma_v / \sigma_w$", color=INK)
     axes.set_ylabel(r"$k_\mathrm{end}$", color=INK)
     axes.legend(frameon=False, fontsize=10, labelcolor=INK, loc="upper right")
-    title = "Where decreasing gains are best held depends on the manoeuvring index alone"
-    axes.set_title(title, loc="left", fontsize=14, fontweight="bold", color=INK, pad=12)
-    return _save(figure, folder / "alpha_beta_k_end.png")
+    title(axes, "Where decreasing gains are best held depends on the manoeuvring index alone")
+    return save(figure, folder / "alpha_beta_k_end.png")
 
 
 def draw_errors(folder: Path, cells: list[Curves]) -> Path:
@@ -73,7 +70,7 @@ def draw_errors(folder: Path, cells: list[Curves]) -> Path:
     Raises:
         TrackmeshError: matplotlib is missing, or the picture cannot be written.
     """
-    figure = _figure((3.7 * len(cells) + 0.4, 7.0))
+    figure = new_figure((3.7 * len(cells) + 0.4, 7.0))
     figure.set_layout_engine("constrained", w_pad=0.1)
     grid = figure.subplots(2, len(cells), sharex=True, sharey="row", squeeze=False)
     for curves, column in zip(cells, grid.T, strict=True):
@@ -86,10 +83,9 @@ def draw_errors(folder: Path, cells: list[Curves]) -> Path:
     grid[0, 0].set_ylabel("position (m)", color=INK)
     grid[1, 0].set(yscale="log")
     grid[1, 0].set_ylabel("velocity (m/s)", color=INK)
-    _ticks(grid[1, 0].yaxis, _ERROR_TICKS)
-    title = "Standard deviation of the error after each plot"
-    figure.suptitle(title, x=0.01, ha="left", fontsize=14, fontweight="bold", color=INK)
-    return _save(figure, folder / "alpha_beta_errors.png")
+    log_ticks(grid[1, 0].yaxis, _ERROR_TICKS)
+    figure_title(figure, "Standard deviation of the error after each plot")
+    return save(figure, folder / "alpha_beta_errors.png")
 
 
 def _draw_printed(axes: Axes, printed: list[Printed]) -> None:
@@ -128,39 +124,5 @@ def _draw_curves(axes: Axes, curves: Curves, coordinate: int) -> None:
         color, width = (TRUTH, 4.0) if i == last else (TRACKS[i], 1.6)
         axes.plot(k, curves.sigma[i, 1:, coordinate], label=name, color=color, lw=width, zorder=1 if i == last else 3)
     axes.set(xscale="log", xlim=(2.0, k[-1]))
-    _ticks(axes.xaxis, _PLOT_TICKS)
-    _dress(axes)
-
-
-def _ticks(axis: Axis, values: tuple[float, ...]) -> None:
-    """Few labelled ticks on a logarithmic axis."""
-    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
-
-    axis.set_major_locator(FixedLocator(values))
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-
-
-def _dress(axes: Axes) -> None:
-    axes.grid(color=GRID, lw=0.8, zorder=0)
-    axes.set_axisbelow(True)
-    axes.tick_params(colors=MUTED, labelsize=9)
-    for spine in axes.spines.values():
-        spine.set_color(GRID)
-
-
-def _figure(size: tuple[float, float]) -> Figure:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise TrackmeshError("Drawing needs matplotlib; install it with: pip install 'trackmesh[studies]'.") from None
-    return Figure(figsize=size, layout="constrained", facecolor=PAPER)
-
-
-def _save(figure: Figure, out: Path) -> Path:
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(out, dpi=150, bbox_inches="tight", pad_inches=0.25)
-    except OSError as error:
-        raise TrackmeshError(f"Cannot write {out}: {error.strerror or error}.") from None
-    return out
+    log_ticks(axes.xaxis, _PLOT_TICKS)
+    dress(axes)
