@@ -185,6 +185,7 @@ sensor_biases = built(
         locked=st.booleans(),
         pairs=counts,
         jumps=counts,
+        notes=st.lists(texts, max_size=2),
     ),
 )
 

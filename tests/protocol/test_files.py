@@ -26,10 +26,12 @@ from trackmesh.protocol.errors import RefusedMessage, TrackmeshError
 from trackmesh.protocol.files import (
     RECORD_TYPES,
     RecordWriter,
+    RegistrationRecord,
     Tick,
     UnitRecord,
     from_line,
     read_records,
+    replace_with,
     to_line,
 )
 from trackmesh.protocol.messages import Geodetic, Message, PlotBatch, SensorInfo
@@ -42,9 +44,12 @@ units = st.builds(
     boot_id=boot_ids,
     first_track_number=st.integers(0, 2**41 - 1),
     settings=st.dictionaries(texts, json_values, max_size=3),
+    registration=st.none() | st.builds(RegistrationRecord, t_ns=times_ns, state=st.just({})),
 )
+registrations = st.builds(RegistrationRecord, t_ns=times_ns, state=st.dictionaries(texts, json_values, max_size=3))
 RECORDS: dict[type[Message], st.SearchStrategy[Any]] = {
     UnitRecord: units,
+    RegistrationRecord: registrations,
     Geodetic: places,
     Tick: st.builds(Tick, t_ns=times_ns),
     **{kind: VALID[kind] for kind in RECORD_TYPES.values() if issubclass(kind, TopMessage)},
@@ -164,3 +169,13 @@ def test_files_that_cannot_be_read_are_one_sentence(tmp_path: Path) -> None:
     assert wrong(tmp_path / "binary") == f"{tmp_path / 'binary'} is not a text file."
     with pytest.raises(TrackmeshError, match=r"Cannot write .*: No such file or directory\."):
         RecordWriter(tmp_path / "none" / "box.jsonl")
+
+
+def test_a_file_of_one_record_is_replaced_whole(tmp_path: Path) -> None:
+    path = tmp_path / "one.jsonl"
+    for t_ns in (1, 2):
+        replace_with(path, Tick(t_ns=t_ns))
+        assert list(read_records(path)) == [Tick(t_ns=t_ns)]
+    assert [one.name for one in tmp_path.iterdir()] == ["one.jsonl"]
+    with pytest.raises(TrackmeshError, match="Cannot write"):
+        replace_with(tmp_path / "nowhere" / "one.jsonl", Tick(t_ns=3))

@@ -24,6 +24,7 @@ from trackmesh.protocol.messages import (
     EmiScanBatch,
     HistoryQuery,
     RefinedFrame,
+    Registration,
     SensorInfo,
     ServiceStatus,
     TrackFrame,
@@ -150,6 +151,10 @@ class Client:
     def watch_refined(self, unit: str = "*", *, capacity: int = 4096) -> Watch[RefinedFrame]:
         """Refined states of some plots ago, of units whose ``lag`` is set."""
         return Watch(self.bus.subscribe(self.keys.refined(unit), history=True, capacity=capacity), RefinedFrame)
+
+    def watch_registration(self, unit: str = "*") -> Watch[Registration]:
+        """What units think is wrong with their sensors, the present first."""
+        return Watch(self.bus.subscribe(self.keys.registration(unit), history=True), Registration)
 
     def watch_statuses(self, kind: str = "*", unit: str = "*") -> Watch[ServiceStatus]:
         """How services are, once a second each, the present first."""

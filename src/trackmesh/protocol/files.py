@@ -38,6 +38,13 @@ class Tick(Message):
     t_ns: UnixNs
 
 
+class RegistrationRecord(Message):
+    """What a unit knew of its sensors' biases at a time, kept over restarts."""
+
+    t_ns: UnixNs
+    state: dict[str, Any]
+
+
 class UnitRecord(Message):
     """Who recorded a black box, and with which settings: what is needed to give the same frames again."""
 
@@ -46,11 +53,13 @@ class UnitRecord(Message):
     boot_id: BootId
     first_track_number: Annotated[int, Field(ge=0, lt=2**41)]
     settings: dict[str, Any]
+    registration: RegistrationRecord | None = None
 
 
 Record = Message
 RECORD_TYPES: dict[str, type[Message]] = {
     "unit": UnitRecord,
+    "registration": RegistrationRecord,
     "origin": Geodetic,
     "sensor": SensorInfo,
     "plots": PlotBatch,
@@ -151,3 +160,17 @@ class RecordWriter:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
+
+
+def replace_with(path: Path, record: Message) -> None:
+    """Make a file hold this one record; whoever reads it meanwhile sees the old one or the new one, whole.
+
+    Raises:
+        TrackmeshError: it cannot be written.
+    """
+    beside = path.with_name(path.name + ".new")
+    try:
+        beside.write_text(to_line(record) + "\n", encoding="utf-8")
+        beside.replace(path)
+    except OSError as error:
+        raise TrackmeshError(f"Cannot write {path}: {error.strerror or error}.") from None

@@ -8,12 +8,10 @@ import scipy.linalg
 from filterpy.kalman import KalmanFilter
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.services.estimation.makers import LAW, FloatArray, IntArray, plain_python, seeds
+from tests.services.estimation.alpha_beta_makers import filtered, held, scales, simulated
+from tests.services.estimation.makers import LAW, FloatArray, seeds
 
 from trackmesh.services.estimation import alpha_beta as ab
-
-INDICES = (0.005, 0.0158, 0.05, 0.158, 0.3, 0.6, 1.2, 3.0)
-"""The range for which a bank is made."""
 
 VARIANCES_V = np.array([0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 28.0, 35.0])
 INTERVALS_S = np.array([0.5, 1.0, 2.0, 6.0, 10.0, 12.0])
@@ -21,7 +19,6 @@ LAMBDAS = ab.manoeuvring_index(INTERVALS_S, np.sqrt(VARIANCES_V)[:, None], np.ar
 """The manoeuvring indices of the 120 cells of Qiu and Qiu (2016)."""
 
 lambdas = st.floats(-4.0, 3.0).map(lambda e: 10.0**e)
-scales = st.floats(-3.0, 3.0).map(lambda e: 10.0**e)
 counts = st.integers(1, 500)
 
 
@@ -32,11 +29,6 @@ def flow(dt_s: float) -> FloatArray:
 def noise(dt_s: float, sigma_v: float) -> FloatArray:
     G = np.array([dt_s * dt_s / 2.0, dt_s])
     return np.asarray(sigma_v * sigma_v * np.outer(G, G))
-
-
-def held(k_end: IntArray, n: int) -> tuple[FloatArray, FloatArray]:
-    """Decreasing gains held from ``k_end`` (...) on, (..., n)."""
-    return ab.decreasing_gains(np.minimum(np.arange(1, n + 1), np.asarray(k_end)[..., None]))
 
 
 def dense_kalman(dt_s: float, sigma_v: float, sigma_w: float, n: int) -> tuple[FloatArray, FloatArray]:
@@ -58,42 +50,6 @@ def dense_kalman(dt_s: float, sigma_v: float, sigma_w: float, n: int) -> tuple[F
 def position_rms(gains: tuple[FloatArray, FloatArray], index: FloatArray) -> FloatArray:
     """Over plots 2 to n of gains (..., n), in units of sigma_w."""
     return np.asarray(np.sqrt(ab.error_covariances(*gains, 1.0, index, 1.0)[..., 1:, 0, 0].mean(axis=-1)))
-
-
-def simulated(index: float, tracks: int, plots: int, seed: int) -> tuple[FloatArray, FloatArray]:
-    """Truth (plots, tracks, 4) and plots (plots, tracks, 2) with T = 1 and sigma_w = 1."""
-    rng = np.random.default_rng(seed)
-    x, truth = np.concatenate([np.zeros((tracks, 2)), rng.normal(0.0, 3.0, (tracks, 2))], axis=1), []
-    for _ in range(plots):
-        push = rng.normal(0.0, index, (tracks, 2))
-        x = np.concatenate([x[:, :2] + x[:, 2:] + push / 2.0, x[:, 2:] + push], axis=1)
-        truth.append(x)
-    states = np.array(truth)
-    return states, states[..., :2] + rng.normal(size=(plots, tracks, 2))
-
-
-def filtered(z: FloatArray, dt_s: FloatArray, alpha: FloatArray, beta: FloatArray) -> FloatArray:
-    """States (plots, n, 4) of n tracks with plots (plots, n, 2) at intervals (plots,) under gains (plots,)."""
-    n, x, found = z.shape[1], np.full((z.shape[1], 4), np.nan), []
-    for k in range(len(z)):
-        same = (np.full(n, v) for v in (dt_s[k], k + 1, alpha[k], beta[k]))
-        x = ab.step(x, z[k], *same)
-        found.append(x)
-    return np.array(found)
-
-
-def banked(z: FloatArray, dt_s: float = 1.0) -> tuple[FloatArray, FloatArray]:
-    """Means (plots, n, 4) and covariances (plots, n, 4, 4) of a bank fed with plots (plots, n, 2)."""
-    rows, every = np.arange(z.shape[1]), np.full(z.shape[1], dt_s)
-    bank, found = ab.make_bank(len(rows)), []
-    for plots in z:
-        ab.feed_bank(bank, rows, plots, every)
-        found.append(ab.bank_estimate(bank, rows, every))
-    return np.array([mean for mean, _ in found]), np.array([P for _, P in found])
-
-
-def rms(error: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(error))))
 
 
 # gains
@@ -353,106 +309,3 @@ def test_steady_covariance_is_where_errors_end_and_broadcasts() -> None:
 def test_unstable_gains_have_no_steady_covariance(alpha: float, beta: float, dt_s: float) -> None:
     with pytest.raises(ValueError, match="needs alpha > 0"):
         ab.steady_covariance(alpha, beta, dt_s, 1.0, 1.0)
-
-
-# the bank
-
-
-@pytest.mark.parametrize("index", INDICES)
-def test_the_bank_is_near_the_kalman_filter_that_knows_the_noise(index: float) -> None:
-    # 1000 tracks of 100 plots; both filters see the same plots.
-    truth, z = simulated(index, 1000, 100, 7)
-    best = filtered(z, np.ones(100), *ab.kalman_gains(100, index)) - truth
-    error = banked(z)[0] - truth
-    assert rms(error[1:, :, :2]) <= 1.13 * rms(best[1:, :, :2])
-    assert rms(error[1:, :, 2:]) <= 1.13 * rms(best[1:, :, 2:])
-
-
-@pytest.mark.parametrize("index", [0.0, *INDICES, 10.0])
-def test_the_banks_covariance_holds_its_errors(index: float) -> None:
-    truth, z = simulated(index, 500, 100, 8)
-    mean, P = banked(z)
-    error = (mean - truth)[40:]
-    distance = np.sum(error * np.linalg.solve(P[40:], error[..., None])[..., 0], axis=-1)
-    assert 0.93 < np.mean(distance < 9.488) < 0.999
-    np.testing.assert_array_equal(P, P.swapaxes(-1, -2))
-
-
-def test_the_indices_of_the_bank_are_those_of_its_k_end() -> None:
-    np.testing.assert_array_equal(ab.k_end_rule(ab.BANK_INDEX), ab.BANK_K_END)
-
-
-def test_each_filter_of_the_bank_is_the_plain_filter() -> None:
-    _, z = simulated(0.2, 3, 60, 2)
-    bank, rows = ab.make_bank(3), np.arange(3)
-    for plots in z:
-        ab.feed_bank(bank, rows, plots, np.full(3, 2.5))
-    for c, k_end in enumerate(ab.BANK_K_END):
-        np.testing.assert_allclose(bank.x[:, c], filtered(z, np.full(60, 2.5), *held(k_end, 60))[-1], rtol=1e-10)
-
-
-def test_the_energy_is_the_mean_squared_innovation() -> None:
-    _, z = simulated(0.2, 2, 15, 3)
-    bank, rows, dt_s = ab.make_bank(2), np.arange(2), np.ones(2)
-    squares = []
-    for k, plots in enumerate(z):
-        predicted = bank.x[:, :, :2] + bank.x[:, :, 2:]
-        ab.feed_bank(bank, rows, plots, dt_s)
-        if k >= 2:
-            squares.append(np.square(plots[:, None] - predicted))
-    np.testing.assert_allclose(bank.energy, np.mean(squares, axis=0))
-
-
-@LAW
-@given(seeds, scales, scales, st.floats(-1e4, 1e4))
-def test_the_bank_knows_no_units_and_no_place(seed: int, metres: float, seconds: float, place: float) -> None:
-    z = np.random.default_rng(seed).normal(size=(30, 2, 2)) * [1.0, 5.0]
-    mean, P = (a[-1] for a in banked(z))
-    got_mean, got_P = (a[-1] for a in banked(metres * (z + place), seconds))
-    factor = metres * np.array([1.0, 1.0, 1.0 / seconds, 1.0 / seconds])
-    shift = metres * place * np.array([1.0, 1.0, 0.0, 0.0])
-    np.testing.assert_allclose((got_mean - shift) / factor, mean, atol=1e-6)
-    np.testing.assert_allclose(got_P / np.outer(factor, factor), P, rtol=1e-4, atol=1e-6)
-    assert np.all(np.linalg.eigvalsh(P) > 0.0)
-
-
-def test_a_straight_line_without_noise_is_followed_exactly() -> None:
-    z = np.arange(40.0)[:, None, None] * np.array([3.0, -2.0])
-    mean, P = (a[-1, 0] for a in banked(z))
-    np.testing.assert_allclose(mean, [117.0, -78.0, 3.0, -2.0], atol=1e-9)
-    assert np.all(np.abs(P) < 1e-12)
-
-
-def test_before_the_fifth_plot_the_bank_says_that_it_does_not_know() -> None:
-    _, P = banked(simulated(0.2, 3, 6, 5)[1])
-    np.testing.assert_array_equal(P[:4], np.broadcast_to(np.diag(np.full(4, np.inf)), (4, 3, 4, 4)))
-    assert np.all(np.isfinite(P[4:]))
-
-
-def test_rows_are_apart_may_repeat_and_start_anew() -> None:
-    _, z = simulated(0.2, 1, 12, 6)
-    alone, _ = banked(z)
-    bank, one = ab.make_bank(3), np.array([1])
-    ab.feed_bank(bank, np.array([1, 1, 1]), np.full((3, 2), 1e6), np.ones(3))
-    assert bank.k.tolist() == [0, 3, 0]
-    assert not bank.x[[0, 2]].any()
-    bank.k[1] = 0
-    ab.feed_bank(bank, np.ones(12, np.int64), z[:, 0], np.ones(12))
-    np.testing.assert_array_equal(ab.bank_estimate(bank, one, np.ones(1))[0], alone[-1])
-
-
-def test_an_estimate_wants_an_interval() -> None:
-    with pytest.raises(ValueError, match="positive"):
-        ab.bank_estimate(ab.make_bank(1), np.array([0]), np.array([0.0]))
-
-
-def walked() -> list[float]:
-    _, z = simulated(0.2, 2, 25, 9)
-    mean, P = (a[-1] for a in banked(z))
-    path = filtered(z, np.ones(25), *held(np.array(6), 25))[-1]
-    return [*mean.ravel().tolist(), *P.ravel().tolist(), *path.ravel().tolist()]
-
-
-def test_uncompiled_code_gives_the_same() -> None:
-    got = plain_python("walked()", "tests.services.estimation.test_alpha_beta")
-    np.testing.assert_allclose(walked(), got, rtol=1e-10)

@@ -32,15 +32,17 @@ def all_pairs(n: int, m: int) -> tuple[IntArray, IntArray]:
 def test_distances_equal_a_dense_solution(seed: int, n: int, m: int) -> None:
     rng = np.random.default_rng(seed)
     (xa, Pa), (xb, Pb), (i, j) = states(rng, n), states(rng, m), all_pairs(n, m)
+    blur = covariances(rng, (len(i),), 2, 1e4)
     d, S = xa[i] - xb[j], Pa[i] + Pb[j]
-    distance, logdet = state_distances(xa, Pa, xb, Pb, i, j)
+    S[:, :2, :2] += blur
+    distance, logdet = state_distances(xa, Pa, xb, Pb, i, j, blur)
     np.testing.assert_allclose(distance, np.einsum("ka,ka->k", d, np.linalg.solve(S, d[..., None])[..., 0]), rtol=1e-8)
     np.testing.assert_allclose(logdet, np.linalg.slogdet(S)[1], atol=1e-8)
 
 
 def test_a_pair_without_a_positive_covariance_is_infinitely_far() -> None:
     x, P, zero = np.zeros((1, 4)), np.zeros((1, 4, 4)), np.zeros(1, np.int64)
-    distance, _ = state_distances(x, P, x, P, zero, zero)
+    distance, _ = state_distances(x, P, x, P, zero, zero, np.zeros((1, 2, 2)))
     assert np.isinf(distance).all()
 
 
@@ -51,7 +53,7 @@ def test_the_increment_is_the_ratio_of_student_t_to_unrelated_tracks(seed: int, 
     rules = UNCLIPPED._replace(nu=nu)
     (xa, Pa), (xb, Pb), zero = states(rng, 1), states(rng, 1), np.zeros(1, np.int64)
     rho = rng.uniform(1e-10, 1e-6, 1)
-    got = log_ratio(rules, *state_distances(xa, Pa, xb, Pb, zero, zero), rho)
+    got = log_ratio(rules, *state_distances(xa, Pa, xb, Pb, zero, zero, np.zeros((1, 2, 2))), rho)
     # The t density here has S as its scale matrix.
     related = scipy.stats.multivariate_t(np.zeros(4), (Pa + Pb)[0], df=nu).logpdf((xa - xb)[0])
     # Velocities of two unrelated tracks differ by a normal of variance 2 s_v^2 per axis; at equal velocities that is

@@ -14,7 +14,11 @@ EAST = np.array([1.0, 0.0, 0.0, 0.0])
 
 def tracks(number: list[int] | IntArray, x: FloatArray) -> LocalTracks:
     """Local tracks with honest and equal covariances."""
-    return LocalTracks(np.asarray(number, np.int64), np.asarray(x, float), np.tile(np.diag(SIGMA**2), (len(x), 1, 1)))
+    n = len(x)
+    return LocalTracks(
+        np.asarray(number, np.int64), np.arange(n), np.asarray(x, float), np.tile(np.diag(SIGMA**2), (n, 1, 1)),
+        np.zeros((n, 2)), np.zeros((n, 2, 2)),
+    )  # fmt: skip
 
 
 def sky(rng: np.random.Generator, n: int, span_m: float = 1e5) -> FloatArray:

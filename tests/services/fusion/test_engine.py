@@ -33,7 +33,7 @@ from tests.services.fusion.makers import (
 
 from trackmesh.protocol.codec import encode
 from trackmesh.protocol.messages import PlotBatch, TrackFrame, TrackQuery
-from trackmesh.services.fusion.association import DeclaredPairs, LocalTracks, SequentialTest
+from trackmesh.services.fusion.association import Blur, DeclaredPairs, LocalTracks, SequentialTest
 
 
 def two_radars(targets: Fleet = FAR_APART, until_s: float = 40.0, p_detect: float = 0.9) -> list[PlotBatch]:
@@ -221,7 +221,7 @@ def test_duplicates_that_a_declared_pair_joins_become_one() -> None:
 def test_a_declared_pair_does_not_overrule_the_plots(seen_by_both: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A wrong pair of two targets: both sensors hold a member in each, or the two are far apart."""
 
-    def wrong(_: SequentialTest, a: LocalTracks, b: LocalTracks, t_s: float) -> DeclaredPairs:
+    def wrong(_: SequentialTest, a: LocalTracks, b: LocalTracks, t_s: float, blur: Blur | None) -> DeclaredPairs:
         found = int(len(a.number) > 0 and len(b.number) > 0)
         return DeclaredPairs(np.zeros(found, np.int64), np.full(found, len(b.number) - 1), np.ones(found))
 
@@ -230,7 +230,7 @@ def test_a_declared_pair_does_not_overrule_the_plots(seen_by_both: bool, monkeyp
     first, second = (Fleet(pair.start[k : k + 1], pair.velocity[k : k + 1]) for k in (0, 1))
     if seen_by_both:
         first = second = pair
-    tracker = engine(NORTH, EAST)
+    tracker = engine(NORTH, EAST, registration=False)  # the wrong pairs would teach it wrong biases
     frames = drive(tracker, in_time_order(scans(NORTH, first, 60.0), scans(EAST, second, 60.0, offset_s=0.7)))
     assert tracker.counters["merged"] == 0
     assert tracker.counters["contradictions"] > 5
@@ -282,7 +282,7 @@ def test_whole_turns_and_sectors_give_one_picture() -> None:
 def test_a_late_batch_gives_what_it_would_have_given_in_time() -> None:
     batches = two_radars(until_s=40.0, p_detect=1.0)
     late = [*batches[:10], *batches[11:13], batches[10], *batches[13:]]
-    in_time, swapped = engine(NORTH, EAST), engine(NORTH, EAST)
+    in_time, swapped = (engine(NORTH, EAST, registration=False) for _ in range(2))
     last, other = drive(in_time, batches)[-1], drive(swapped, late)[-1]
     assert in_time.counters == swapped.counters
     assert np.array_equal(last.state, other.state)

@@ -61,7 +61,8 @@ def test_every_filter_tracks_four_targets(kind: str) -> None:
 def test_late_batches_replay_exactly(kind: str) -> None:
     in_time = batches()
     late = [*in_time[:10], *in_time[11:13], in_time[10], *in_time[13:]]
-    one, other = (drive(engine(NORTH, EAST, filter=kind), b)[-1] for b in (in_time, late))
+    # A plot is corrected by the biases that are known when it comes: with registration the order counts.
+    one, other = (drive(engine(NORTH, EAST, filter=kind, registration=False), b)[-1] for b in (in_time, late))
     assert np.array_equal(one.track_id, other.track_id)
     assert np.array_equal(one.state, other.state)
     assert np.array_equal(one.covariance, other.covariance)

@@ -143,7 +143,10 @@ class BandFrame(TopMessage):
 
 
 class SensorBias(Message):
-    """One sensor's estimated bias: [range_m, azimuth_rad] of a radar, [east_m, north_m] of a position sensor."""
+    """One sensor's estimated bias: [range_m, azimuth_rad] of a radar, [east_m, north_m] of a position sensor.
+
+    What it measures minus what is true. ``notes`` say which of it the data cannot tell, and why.
+    """
 
     sensor_id: Id
     columns: Annotated[list[str], Field(min_length=2, max_length=2)]
@@ -152,6 +155,7 @@ class SensorBias(Message):
     locked: bool
     pairs: Count
     jumps: Count
+    notes: Annotated[list[str], Field(max_length=16, fail_fast=True)] = []
 
 
 class Registration(TopMessage):

@@ -80,6 +80,10 @@ def fusion(
         Path | None,
         typer.Option("--black-box", metavar="FILE", help="Record the engine's inputs, for trackmesh track."),
     ] = None,
+    registration_file: Annotated[
+        Path | None,
+        typer.Option("--registration-file", metavar="FILE", help="Keep the sensors' biases here over restarts."),
+    ] = None,
     log_level: LogLevel = None,
     log_format: LogFormat = None,
 ) -> None:
@@ -89,6 +93,7 @@ def fusion(
 
     flags = _given(
         connect=connect, realm=realm, unit_id=unit_id, unit_number=unit_number, clock=clock, black_box=black_box,
+        registration_file=registration_file,
         log_level=log_level, log_format=log_format,
     )  # fmt: skip
     raise typer.Exit(run(FusionSettings.load(config, flags)))

@@ -7,6 +7,7 @@ plot. Plots must come in order of time: a late one is refused.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy.typing as npt
 from trackmesh.services.estimation.alpha_beta import combined_gains, manoeuvring_index
 from trackmesh.services.estimation.gating import Mixture, Strength, make_mixture, near
 from trackmesh.services.estimation.jit import kernel
-from trackmesh.services.estimation.plots import Plot, Plots
+from trackmesh.services.estimation.plots import Plot, Plots, empty_plots
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -174,6 +175,13 @@ class AlphaBetaTracks:
         return _feed(self._rows, rows, plots, alpha, beta, self._acceleration_mps2)
 
     def feed_from(self, source: int, target: int) -> None:
+        """Nothing: no plots are remembered."""
+
+    def remembered(self, row: int) -> Plots:
+        """None."""
+        return empty_plots((0,))
+
+    def move_plots(self, sensor: int, move: Callable[[FloatArray], FloatArray]) -> None:
         """Nothing: no plots are remembered."""
 
     def near(self, rows: IntArray, plots: Plots, limit: float) -> IntArray:

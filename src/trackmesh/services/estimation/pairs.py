@@ -49,11 +49,12 @@ class PairRules(NamedTuple):
 
 @kernel
 def state_distances(
-    xa: FloatArray, Pa: FloatArray, xb: FloatArray, Pb: FloatArray, ia: IntArray, ib: IntArray
+    xa: FloatArray, Pa: FloatArray, xb: FloatArray, Pb: FloatArray, ia: IntArray, ib: IntArray, blur: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """d^T S^-1 d and ln|S| of pairs, d = xa[ia] - xb[ib], S = Pa[ia] + Pb[ib], 4 states, by Cholesky.
 
-    A pair whose S is not positive definite gets an infinite distance.
+    ``blur`` (n, 2, 2) is added to the position block of S: what the difference of the sensors' biases is not known
+    better than. A pair whose S is not positive definite gets an infinite distance.
     """
     n = len(ia)
     distance, logdet = np.empty(n), np.empty(n)
@@ -64,6 +65,8 @@ def state_distances(
         for a in range(4):
             for b in range(a + 1):
                 value = Pa[i, a, b] + Pb[j, a, b]
+                if a < 2:
+                    value += blur[k, a, b]
                 for c in range(b):
                     value -= L[a, c] * L[b, c]
                 if a == b:

@@ -8,6 +8,7 @@ is what filtering in order would have given. A plot older than the base is refus
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -270,8 +271,27 @@ class ImmTracks:
 
     def feed_from(self, source: int, target: int) -> None:
         """Feed the plots that row ``source`` remembers to row ``target``."""
-        plots = self.filters.ring[source, : self.filters.ring_n[source]].copy()
+        plots = self.remembered(source)
         feed(self.models, self.filters, np.full(len(plots), target), plots)
+
+    def remembered(self, row: int) -> Plots:
+        """The last plots of a row, in order of time."""
+        return self.filters.ring[row, : self.filters.ring_n[row]].copy()
+
+    def move_plots(self, sensor: int, move: Callable[[FloatArray], FloatArray]) -> None:
+        """Move the remembered plots of a sensor, positions (m, 2) to (m, 2), and filter them again from the base."""
+        f = self.filters
+        there = np.arange(f.ring.shape[1]) < f.ring_n[:, None]
+        ours = there & (f.ring["sensor"] == sensor)
+        if not ours.any():
+            return
+        f.ring["z"][ours] = move(f.ring["z"][ours])
+        rows = np.flatnonzero(ours.any(axis=1))
+        row, place = np.nonzero(there[rows])
+        plots = f.ring[rows[row], place]
+        f.head[rows] = f.base[rows]
+        f.ring_n[rows] = 0
+        feed(self.models, f, rows[row], plots)
 
     def near(self, rows: IntArray, plots: Plots, limit: float) -> IntArray:
         """The rows that may have a plot in their gate."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from trackmesh.services.estimation.pairs import (
 from trackmesh.services.estimation.plots import make_plots
 
 FloatArray = npt.NDArray[np.float64]
+Blur = Callable[[FloatArray, FloatArray], FloatArray]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
@@ -32,11 +34,24 @@ _HYSTERESIS = 0.5
 
 
 class LocalTracks(NamedTuple):
-    """Local tracks of one sensor at one time: number (n,) below 2^31, x (n, 4), P (n, 4, 4)."""
+    """Local tracks of one sensor at one time, in its raw frame.
+
+    Attributes:
+        number: (n,) below 2^31. row: (n,) in its layer.
+        x, P: (n, 4), (n, 4, 4).
+        shift, blur: (n, 2), (n, 2, 2) what the sensor's bias does to the position, as far as it is known.
+    """
 
     number: IntArray
+    row: IntArray
     x: FloatArray
     P: FloatArray
+    shift: FloatArray
+    blur: FloatArray
+
+    def corrected(self) -> FloatArray:
+        """States (n, 4) without the shift."""
+        return np.concatenate([self.x[:, :2] - self.shift, self.x[:, 2:]], axis=1)
 
 
 class DeclaredPairs(NamedTuple):
@@ -66,11 +81,18 @@ class SequentialTest:
         self.rules = rules
         self._pairs = _blank(0)
 
-    def cycle(self, a: LocalTracks, b: LocalTracks, t_s: float) -> DeclaredPairs:
-        """Add the evidence of this moment and declare pairs, one to one."""
+    def cycle(self, a: LocalTracks, b: LocalTracks, t_s: float, blur: Blur | None = None) -> DeclaredPairs:
+        """Add the evidence of this moment and declare pairs, one to one.
+
+        Args:
+            a, b: the tracks of the two sensors.
+            t_s: now.
+            blur: gives, for pairs of raw states, the covariance (n, 2, 2) of the difference of the sensors' shifts.
+        """
         key, ia, ib, near = self._candidates(a, b)
         old, known = self._recall(key)
-        distance, logdet = state_distances(a.x, a.P, b.x, b.P, ia, ib)
+        unknown = blur(a.x[ia], b.x[ib]) if blur else np.zeros((len(ia), 2, 2))
+        distance, logdet = state_distances(a.corrected(), a.P, b.corrected(), b.P, ia, ib, unknown)
         density = local_density(a.x, b.x, self.rules.radius_m)[ia]
         pairs = self._add(key, old, known, distance, log_ratio(self.rules, distance, logdet, density), t_s)
         barred = pairs.misfit > self.rules.fit_limit * chi2_upper(4.0 * np.maximum(pairs.weight, 1.0))
@@ -88,11 +110,12 @@ class SequentialTest:
         """Pairs close in position, and pairs under test whose tracks both live; which of them are close."""
         near = np.empty(0, np.int64)
         if len(a.number) and len(b.number):
-            R = np.stack([b.P[:, 0, 0], b.P[:, 0, 1], b.P[:, 1, 1]], axis=1)
-            tracks = Mixture(
-                np.ascontiguousarray(a.x[:, None]), np.ascontiguousarray(a.P[:, None]), np.ones((len(a.number), 1))
-            )
-            i, j, _ = gating.gate(tracks, np.zeros(len(a.number)), make_plots(b.x[:, :2], R, 0.0), _CANDIDATE_GATE)
+            R = b.P[:, :2, :2] + b.blur
+            plots = make_plots(b.corrected()[:, :2], np.stack([R[:, 0, 0], R[:, 0, 1], R[:, 1, 1]], axis=1), 0.0)
+            P = a.P.copy()
+            P[:, :2, :2] += a.blur
+            tracks = Mixture(np.ascontiguousarray(a.corrected()[:, None]), P[:, None], np.ones((len(P), 1)))
+            i, j, _ = gating.gate(tracks, np.zeros(len(P)), plots, _CANDIDATE_GATE)
             near = (a.number[i] << 31) | b.number[j]
         key = np.union1d(near, self._pairs.key)
         ia, ib = index_of(a.number, key >> 31), index_of(b.number, key & NUMBER_MASK)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from trackmesh.protocol.files import RecordWriter, Tick, UnitRecord
+from trackmesh.protocol.files import RecordWriter, RegistrationRecord, Tick, UnitRecord
 from trackmesh.protocol.messages import Geodetic, PlotBatch, SensorInfo
 from trackmesh.services.fusion.engine import Unit
 from trackmesh.services.fusion.settings import EngineSettings
 
 
-def unit_record(unit: Unit, settings: EngineSettings) -> UnitRecord:
+def unit_record(unit: Unit, settings: EngineSettings, registration: RegistrationRecord | None = None) -> UnitRecord:
     """The first line of a black box."""
     return UnitRecord(
         unit_id=unit.unit_id,
@@ -18,6 +18,7 @@ def unit_record(unit: Unit, settings: EngineSettings) -> UnitRecord:
         boot_id=unit.boot_id,
         first_track_number=unit.first_track,
         settings=settings.model_dump(mode="json"),
+        registration=registration,
     )
 
 
@@ -28,9 +29,16 @@ class BlackBox:
         TrackmeshError: the file cannot be written.
     """
 
-    def __init__(self, path: Path, unit: Unit, settings: EngineSettings, origin: Geodetic | None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        unit: Unit,
+        settings: EngineSettings,
+        origin: Geodetic | None,
+        registration: RegistrationRecord | None = None,
+    ) -> None:
         self._writer = RecordWriter(path)
-        self._writer.write(unit_record(unit, settings))
+        self._writer.write(unit_record(unit, settings, registration))
         if origin is not None:
             self._writer.write(origin)
 

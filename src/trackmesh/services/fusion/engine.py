@@ -14,14 +14,25 @@ import numpy as np
 import numpy.typing as npt
 
 from trackmesh.protocol.errors import RefusedMessage
-from trackmesh.protocol.messages import ENDED, Geodetic, PlotBatch, RefinedFrame, SensorInfo, TrackFrame, TrackQuery
-from trackmesh.services.estimation.lookup import index_of
-from trackmesh.services.estimation.pairs import PairRules, state_distances
+from trackmesh.protocol.messages import (
+    ENDED,
+    Geodetic,
+    PlotBatch,
+    RefinedFrame,
+    Registration,
+    SensorInfo,
+    TrackFrame,
+    TrackQuery,
+)
+from trackmesh.services.estimation.pairs import PairRules
 from trackmesh.services.estimation.plots import Plots
-from trackmesh.services.fusion import frames, life, membership
-from trackmesh.services.fusion.association import NUMBER_MASK, DeclaredPairs, LocalTracks, SequentialTest
+from trackmesh.services.fusion import frames, life
+from trackmesh.services.fusion.biases import Change, moved
+from trackmesh.services.fusion.corrections import Corrections
+from trackmesh.services.fusion.cycle import AssociationCycle
 from trackmesh.services.fusion.layer import Layer, Look
 from trackmesh.services.fusion.life import Rules
+from trackmesh.services.fusion.restart import picture_of
 from trackmesh.services.fusion.sensors import Sensor
 from trackmesh.services.fusion.settings import EngineSettings
 
@@ -31,8 +42,6 @@ _COASTING_AFTER_PERIODS = 1.5
 _TENTATIVE_AGE_PERIODS = 2.2
 _SEEN_LATELY_PERIODS = 5.0
 _JUDGED_SECTORS_LATE = 1.5
-_MERGE_GATE = 25.0
-_HITS_FOR_TEST = 3
 _TRACK_BITS = 41
 _ROWS = 64
 
@@ -57,6 +66,7 @@ class FusionEngine:
     """One unit's tracker.
 
     Attributes:
+        corrections: what is known of the sensors' biases.
         counters: what happened, by name (``plots``, ``late_plots``, ``merged``, ``contradictions``, ...).
         sensors: by id, in the order in which they were first heard of.
         log_likelihood: of all plots so far under the picture, against clutter alone: the plots that tracks took by
@@ -74,9 +84,12 @@ class FusionEngine:
         self._manoeuvre_models = settings.manoeuvre_models()
         self._system = Layer(settings.system_tracks(_ROWS), self._rules(1.0, settings.coast_s), 1, settings.gate)
         self._locals: list[Layer] = []
-        self._tests: dict[tuple[int, int], SequentialTest] = {}
-        self._pair_rules = PairRules(speed_mps=settings.pair_speed_mps, radius_m=settings.pair_radius_m)
-        self._pairs_declared = 0
+        self.corrections = Corrections(settings.registration_rules() if settings.registration else None)
+        self._registration_due = False
+        pair_rules = PairRules(speed_mps=settings.pair_speed_mps, radius_m=settings.pair_radius_m)
+        self._cycle = AssociationCycle(
+            self._system, self._locals, self.corrections.biases, pair_rules, self.counters, self._end
+        )
         self._next_track = unit.first_track
         self._seq = 0
         self._epoch_ns: int | None = None
@@ -102,14 +115,13 @@ class FusionEngine:
                 known.settle(self.origin)
         sensor = Sensor(old.index if old else len(self.sensors), info, self.origin)
         self.sensors[info.sensor_id] = sensor
+        self.corrections.announce(sensor.index, info, sensor.site)
         longest = max(s.info.period_s for s in self.sensors.values())
         self._system.rules = self._rules(longest, self.settings.coast_s)
         rules = self._rules(info.period_s, self.settings.local_coast_periods * info.period_s)
         if old is None:
             self._system.add_sensors(len(self.sensors))
             self._locals.append(Layer(self.settings.local_tracks(_ROWS), rules, 1, self.settings.gate))
-            for other in range(sensor.index):
-                self._tests[other, sensor.index] = SequentialTest(self._pair_rules)
         else:
             self._locals[sensor.index].rules = rules
 
@@ -181,11 +193,22 @@ class FusionEngine:
             covariance=covariance,
         )
 
+    def registration(self) -> Registration | None:
+        """What is known of the sensors' biases, once after every association cycle."""
+        if not self._registration_due:
+            return None
+        self._registration_due = False
+        return self.corrections.message(self.unit.unit_id, self.unit.boot_id, self._seq, self._to_ns(self._now_s))
+
     def figures(self) -> dict[str, float]:
         """Present values for the status: tracks, local tracks, pairs under the sequential test."""
         rows = self._system.rows
         confirmed = int(self._system.life.confirmed[rows].sum())
-        out = {"tracks": confirmed, "tentative": len(rows) - confirmed, "pairs": self._pairs_declared}
+        out = {
+            "tracks": confirmed,
+            "tentative": len(rows) - confirmed,
+            "pairs": sum(len(d.row_a) for d in self._cycle.declared),
+        }
         out |= {f"local_tracks.{s.info.sensor_id}": len(self._locals[s.index].rows) for s in self.sensors.values()}
         return {name: float(value) for name, value in out.items()}
 
@@ -206,7 +229,9 @@ class FusionEngine:
         got = local.step(plots, self._look(sensor, 0, plots, sectors, density), self._now_s)
         sensor.local_clutter.add(n - int(got.by_confirmed.sum()), share)
         density = sensor.system_clutter.value(n, share)
-        fed = self._system.step(plots, self._look(sensor, sensor.index, plots, sectors, density), self._now_s)
+        fed = self._system.step(
+            self.corrections.correct(plots), self._look(sensor, sensor.index, plots, sectors, density), self._now_s
+        )
         sensor.system_clutter.add(n - int(fed.by_confirmed.sum()), share)
         self.log_likelihood += fed.log_likelihood
         self.counters["late_plots"] += fed.late
@@ -245,62 +270,36 @@ class FusionEngine:
         if self._now_s - self._cycle_s < self.settings.cycle_s:
             return
         self._cycle_s = self._now_s
-        for sensor, local in enumerate(self._locals):
-            # The tracks of a sensor that fell silent end here: it steps no more.
-            local.judge(self._now_s)
-            membership.renew(self._system, local, sensor)
-        seen = [self._local_tracks(local) for local in self._locals]
-        self._pairs_declared = 0
-        for (a, b), test in self._tests.items():
-            pairs = test.cycle(seen[a], seen[b], self._now_s)
-            self._pairs_declared += len(pairs.a)
-            self._join(a, b, seen[a].number[pairs.a], seen[b].number[pairs.b], pairs)
+        self._registration_due = self.settings.registration
+        for change in self._cycle.run(list(self.sensors), self._now_s):
+            self._correct(change)
 
-    def _local_tracks(self, local: Layer) -> LocalTracks:
-        rows = local.rows
-        rows = rows[local.life.hits[rows] >= _HITS_FOR_TEST]
-        x, P, _ = local.predict(rows, np.maximum(local.filters.t_s[rows], self._now_s))
-        return LocalTracks(local.life.uid[rows] & NUMBER_MASK, x, P)
+    def _correct(self, change: Change) -> None:
+        """Plots of a sensor are corrected otherwise from now on: move what the system tracks remember of it along."""
+        self.counters[f"registration_{change.kind}"] += 1
+        if change.kind == "locked" and change.shift_m > self.settings.restart_shift_m:
+            self._restart()
+        else:
+            index = self.sensors[change.sensor_id].index
+            self._system.filters.move_plots(index, lambda z: moved(change, z))
 
-    def _join(self, a: int, b: int, number_a: IntArray, number_b: IntArray, pairs: DeclaredPairs) -> None:
-        """Merge system tracks that a declared pair says are one, unless their plots contradict it."""
-        rows = self._system.rows
-        rows = rows[self._system.life.confirmed[rows]]
-        member = self._system.life.member
-        row_a = self._member_rows(rows, member[rows, a], number_a)
-        row_b = self._member_rows(rows, member[rows, b], number_b)
-        apart = (row_a >= 0) & (row_b >= 0) & (row_a != row_b)
-        for one, other in zip(row_a[apart].tolist(), row_b[apart].tolist(), strict=True):
-            self._merge(one, other)
+    def _restart(self) -> None:
+        """Make the picture anew from the local tracks: the tracks so far were of plots that did not fit each other."""
+        for row in self._system.rows.tolist():
+            self._end(row)
+        found = picture_of(self._locals, self._cycle.declared)
+        plots = [self.corrections.correct(one) for one in found.plots]
+        rows = self._system.adopt(plots, found.score)
+        self._name(rows)
+        for k, row in enumerate(rows.tolist()):
+            for sensor, local_row in found.members[k]:
+                life.tie(self._locals[sensor].life, local_row, int(self._system.life.uid[row]))
 
-    @staticmethod
-    def _member_rows(rows: IntArray, members: IntArray, numbers: IntArray) -> IntArray:
-        held = members >= 0
-        place = index_of(members[held] & NUMBER_MASK, numbers)
-        return np.where(place >= 0, rows[held][place] if held.any() else -1, -1)
-
-    def _merge(self, one: int, other: int) -> None:
+    def _end(self, row: int) -> None:
         known = self._system.life
-        if not (known.alive[one] and known.alive[other]):
-            return
-        pair = np.array([one, other])
-        x, P, _ = self._system.predict(pair, np.maximum(self._system.filters.t_s[pair], self._now_s))
-        zero, first = np.zeros(1, np.int64), np.ones(1, np.int64)
-        distance, _ = state_distances(x, P, x, P, zero, first)
-        both = ((known.member[one] >= 0) & (known.member[other] >= 0)).any()
-        if both or distance[0] > _MERGE_GATE:
-            self.counters["contradictions"] += 1
-            return
-        old, young = sorted((one, other), key=lambda row: int(known.link[row]))
-        self._system.filters.feed_from(young, old)
-        free = known.member[old] < 0
-        known.member[old][free] = known.member[young][free]
-        known.last_s[old] = max(known.last_s[old], known.last_s[young])
-        for local in self._locals:
-            local.life.link[local.life.link == known.uid[young]] = known.uid[old]
-        self._note_ended([(young, int(known.uid[young]), int(known.link[young]))])
-        self._system.drop(young)
-        self.counters["merged"] += 1
+        if known.confirmed[row]:
+            self._note_ended([(row, int(known.uid[row]), int(known.link[row]))])
+        self._system.drop(row)
 
     # --- the picture ---
 

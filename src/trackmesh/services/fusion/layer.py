@@ -5,6 +5,7 @@ The same code keeps the local tracks of one sensor and the system tracks of all 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -19,6 +20,7 @@ from trackmesh.services.fusion.life import Life, Rules, make_life
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
+Move = Callable[[FloatArray], FloatArray]
 
 _SCORE_AT_ZERO = 60.0
 _CONFIRMED_FIRST = 200.0
@@ -44,6 +46,8 @@ class TrackFilters(Protocol):
     def predict(self, rows: IntArray, t_s: FloatArray) -> tuple[Mixture, BoolArray]: ...  # noqa: D102
     def estimates(self, mixture: Mixture) -> tuple[FloatArray, FloatArray]: ...  # noqa: D102
     def refined(self, rows: IntArray, lag: int) -> tuple[Mixture, FloatArray]: ...  # noqa: D102
+    def remembered(self, row: int) -> Plots: ...  # noqa: D102
+    def move_plots(self, sensor: int, move: Move) -> None: ...  # noqa: D102
     def grow(self, rows: int) -> None: ...  # noqa: D102
 
 
@@ -149,6 +153,26 @@ class Layer:
         told = [(i, int(self.life.uid[i]), int(self.life.link[i])) for i in gone if self.life.confirmed[i]]
         self._free += gone
         return confirmed[:n_confirmed], told
+
+    def adopt(self, plots: list[Plots], score: FloatArray) -> IntArray:
+        """Start confirmed tracks, each from the plots that are known of it, in order of time; their rows."""
+        if not plots:
+            return np.empty(0, np.int64)
+        rows = self._take(len(plots))
+        first = np.concatenate([one[:1] for one in plots])
+        self.filters.begin(rows, first)
+        t_s = np.ascontiguousarray(first["t_s"])
+        lives.born(self.life, rows, self._next_uid, t_s, 0)
+        self._next_uid += len(rows)
+        for row, one, gain in zip(rows.tolist(), plots, score.tolist(), strict=True):
+            rest = one[1:]
+            self.filters.feed(np.full(len(rest), row), rest)
+            for plot in one:
+                seen = np.array([plot.t_s])
+                lives.hit(self.life, self.rules, np.array([row]), seen, np.zeros(1), int(plot.sensor))
+            self.life.score[row] = self.life.best[row] = gain
+        self.life.confirmed[rows] = True
+        return rows
 
     def drop(self, row: int) -> None:
         """End one track at once."""

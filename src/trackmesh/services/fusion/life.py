@@ -214,6 +214,11 @@ def judge(
     return n_confirmed, n_ended
 
 
+def tie(life: Life, local_row: int, system_uid: int) -> None:
+    """A local row's plots are those of a system track from now on."""
+    life.link[local_row], life.link_n[local_row] = system_uid, 5
+
+
 @kernel
 def share(life: Life, local_rows: IntArray, system_uid: IntArray) -> None:
     """Count shared plots: local row k took a plot that the system track ``system_uid[k]`` (-1: none) took too."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pydantic import ValidationError
 
 from trackmesh.protocol.errors import RefusedMessage, TrackmeshError
-from trackmesh.protocol.files import Tick, UnitRecord
+from trackmesh.protocol.files import RegistrationRecord, Tick, UnitRecord
 from trackmesh.protocol.messages import Geodetic, Message, PlotBatch, RefinedFrame, SensorInfo, TrackFrame
 from trackmesh.services.fusion.engine import FusionEngine, Unit
 from trackmesh.services.fusion.intake import Intake
@@ -37,6 +37,7 @@ class OfflineRun:
         self._unit = Unit(unit_id, unit_number)
         self._origin = origin
         self._intake = Intake(0, 0)
+        self._registration: RegistrationRecord | None = None
         self.engine: FusionEngine | None = None
         self.on_refined: Callable[[RefinedFrame], None] | None = None
         self.refused: Counter[str] = Counter()
@@ -91,8 +92,12 @@ class OfflineRun:
         except ValidationError:
             raise TrackmeshError("The black box was recorded with settings of another version of trackmesh.") from None
         self._unit = Unit(record.unit_id, record.unit_number, record.boot_id, record.first_track_number)
+        self._registration = record.registration
 
     def _running(self) -> FusionEngine:
         if self.engine is None:
             self.engine = FusionEngine(self._settings, self._unit, self._origin)
+            if self._registration is not None:
+                # As old as it was at the start of the recorded run, which wrote that moment into it.
+                self.engine.corrections.restore(self._registration, self._registration.t_ns)
         return self.engine

@@ -11,7 +11,7 @@ from trackmesh.protocol.buffer import Buffer
 from trackmesh.protocol.bus import Query, Sample
 from trackmesh.protocol.codec import decode, encode, encoding, open_envelope
 from trackmesh.protocol.errors import QueryFailed, RefusedMessage, TrackmeshError
-from trackmesh.protocol.files import Tick
+from trackmesh.protocol.files import RegistrationRecord, Tick, read_records, replace_with
 from trackmesh.protocol.keys import kind_and_id, last_chunk
 from trackmesh.protocol.messages import PlotBatch, SensorHealth, SensorInfo, TrackFrame, TrackQuery
 from trackmesh.protocol.serving import answers
@@ -29,6 +29,7 @@ _PLOTS_WAITING = 4096
 _BATCHES_HELD = 64
 _SENSORS_HELD = 256
 _ASK_EVERY_S = 0.5
+_SAVE_EVERY_S = 60.0
 
 
 class FusionService:
@@ -46,13 +47,17 @@ class FusionService:
         self._held: dict[str, deque[PlotBatch]] = {}
         self._answered: Buffer[SensorInfo] = Buffer(_SENSORS_HELD)
         self._tick_due_s = 0.0
+        self._save_due_s = 0.0
         self._black_box: BlackBox | None = None
 
     def start(self) -> None:
         """Compile, subscribe, serve, and be ready."""
         runtime, keys = self.runtime, self.runtime.keys
+        restored = self._restore_registration()
         if self.settings.black_box is not None:
-            self._black_box = BlackBox(self.settings.black_box, self.unit, self.settings.engine, self.settings.origin)
+            self._black_box = BlackBox(
+                self.settings.black_box, self.unit, self.settings.engine, self.settings.origin, restored
+            )
             runtime.on_exit(self._black_box.close)
         runtime.set_state("compiling")
         started = time.monotonic()
@@ -60,9 +65,12 @@ class FusionService:
         runtime.log.info("kernels ready after %.1f s", time.monotonic() - started)
         self._frames = runtime.bus.publisher(keys.tracks(self.unit.unit_id), history=_FRAMES_KEPT)
         self._refined = runtime.bus.publisher(keys.refined(self.unit.unit_id), history=_FRAMES_KEPT)
+        self._biases = runtime.bus.publisher(keys.registration(self.unit.unit_id), history=1)
+        runtime.on_exit(self._save_registration)
         # The engine's thread may publish until it has ended.
         runtime.on_exit(self._frames.close)
         runtime.on_exit(self._refined.close)
+        runtime.on_exit(self._biases.close)
         self._tokens = runtime.closing(runtime.bus.watch_alive(keys.live("*", "*")))
         self._infos = runtime.closing(runtime.bus.subscribe(keys.sensor("*"), history=True))
         self._plots = runtime.closing(runtime.bus.subscribe(keys.plots("*"), history=True, capacity=_PLOTS_WAITING))
@@ -188,9 +196,35 @@ class FusionService:
             self._frames.put(encode(frame), encoding(frame))
             self.runtime.counters.count("frames")
             # Only this thread changes the engine.
-            refined = self.engine.refined()
+            refined, biases = self.engine.refined(), self.engine.registration()
             if refined is not None:
                 self._refined.put(encode(refined), encoding(refined))
+            if biases is not None:
+                self._biases.put(encode(biases), encoding(biases))
+                if time.monotonic() > self._save_due_s:
+                    self._save_registration()
+
+    def _restore_registration(self) -> RegistrationRecord | None:
+        path = self.settings.registration_file
+        if path is None or not path.exists():
+            return None
+        record = next(read_records(path, RegistrationRecord), None)
+        if not isinstance(record, RegistrationRecord):
+            raise TrackmeshError(f"{path} holds no registration.")
+        self.runtime.log.info("biases of %d sensors from %s", len(record.state.get("sensors", [])), path)
+        return self.engine.corrections.restore(record, time.time_ns())
+
+    def _save_registration(self) -> None:
+        self._save_due_s = time.monotonic() + _SAVE_EVERY_S
+        path, now_ns = self.settings.registration_file, self.engine.now_ns
+        record = self.engine.corrections.record(now_ns) if now_ns is not None else None
+        if path is None or record is None:
+            return
+        try:
+            replace_with(path, record)
+        except TrackmeshError as error:
+            self.runtime.log.error("the biases are not kept: %s", error)
+            self.runtime.counters.count("registration_file_failures")
 
     def _record(self, record: SensorInfo | PlotBatch | Tick) -> None:
         if self._black_box is None:

@@ -14,6 +14,7 @@ from trackmesh.services.estimation.alpha_beta_tracks import AlphaBetaTracks
 from trackmesh.services.estimation.bank import Branch, make_models
 from trackmesh.services.estimation.filters import FilterName, generic_models, manoeuvre_models, velocity_models
 from trackmesh.services.estimation.tracks import ImmTracks
+from trackmesh.services.fusion.biases import RegistrationRules
 from trackmesh.services.fusion.layer import TrackFilters
 from trackmesh.services.runtime import ServiceSettings
 
@@ -61,6 +62,14 @@ class EngineSettings(BaseModel):
     cycle_s: Positive = Field(2.0, description="association cycle")
     pair_speed_mps: Positive = Field(250.0, description="spread of velocities expected of unrelated tracks, per axis")
     pair_radius_m: Positive = Field(10_000.0, description="radius in which the density of tracks is counted")
+    registration: bool = Field(True, description="estimate the sensors' biases, and correct plots once they are known")
+    bias_range_m: NonNegative = Field(300.0, description="range bias expected of a radar, one sigma; 0: none")
+    bias_azimuth_deg: NonNegative = Field(0.6, description="azimuth bias expected of a radar, one sigma")
+    bias_position_m: NonNegative = Field(100.0, description="bias expected of a position sensor, one sigma per axis")
+    lock_m: Positive = Field(100.0, description="plots are corrected once the shift at 50 km is known so well")
+    restart_shift_m: Positive = Field(
+        500.0, description="a first correction larger than this at 50 km makes the picture anew from local tracks"
+    )
     frame_period_s: NonNegative = Field(0.0, description="least time between frames; 0: one after every batch")
     idle_frame_s: Positive = Field(1.0, description="time between frames while no data comes")
     publish_tentative: bool = False
@@ -80,6 +89,15 @@ class EngineSettings(BaseModel):
     def local_tracks(self, rows: int) -> TrackFilters:
         """Filters for the local tracks of one sensor."""
         return self._tracks(self.local_filter, rows, self.ring_local, 0)
+
+    def registration_rules(self) -> RegistrationRules:
+        """What to expect of biases."""
+        return RegistrationRules(
+            prior_range_m=self.bias_range_m,
+            prior_azimuth_rad=float(np.deg2rad(self.bias_azimuth_deg)),
+            prior_position_m=self.bias_position_m,
+            lock_m=self.lock_m,
+        )
 
     def model_names(self) -> list[str]:
         """Names of the models in a frame."""
@@ -128,3 +146,6 @@ class FusionSettings(ServiceSettings):
     max_sensors: Annotated[int, Field(ge=1, le=4096)] = Field(128, description="more sensors are refused")
     tick_s: Positive = Field(0.25, description="how often time advances without data")
     black_box: Path | None = Field(None, description="file that records the engine's inputs")
+    registration_file: Path | None = Field(
+        None, description="file that keeps the sensors' biases over restarts; read at the start, written every minute"
+    )

@@ -1,0 +1,84 @@
+"""What is wrong with the sensors, as the engine and the service use it: plots corrected, estimates told and kept."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from trackmesh.protocol.errors import TrackmeshError
+from trackmesh.protocol.files import RegistrationRecord
+from trackmesh.protocol.messages import Registration, SensorBias, SensorInfo
+from trackmesh.services.estimation.plots import Plots
+from trackmesh.services.fusion import registration
+from trackmesh.services.fusion.biases import Estimate, RegistrationRules
+
+
+class Corrections:
+    """The registration of a unit; without rules there is none, and nothing is ever corrected.
+
+    Attributes:
+        biases: the filter over the biases, or None.
+    """
+
+    def __init__(self, rules: RegistrationRules | None) -> None:
+        self.biases = registration.Registration(rules) if rules else None
+        self._ids: list[str] = []
+
+    def announce(self, index: int, info: SensorInfo, site_m: npt.NDArray[np.float64]) -> None:
+        """Take note of a sensor, by its index in the engine, or of its new place."""
+        if index == len(self._ids):
+            self._ids.append(info.sensor_id)
+        if self.biases is not None:
+            self.biases.announce(info.sensor_id, "polar" if info.kind == "radar" else "position", site_m)
+
+    def correct(self, plots: Plots) -> Plots:
+        """Plots of one or more sensors, each corrected by what is applied to its sensor."""
+        if self.biases is None or not any(self.biases.locked(sensor_id) for sensor_id in self._ids):
+            return plots
+        out = plots.copy()
+        for index in np.unique(plots["sensor"]).tolist():
+            of_it = plots["sensor"] == index
+            out["z"][of_it] -= self.biases.shift(self._ids[index], plots["z"][of_it])
+        return out
+
+    def message(self, unit_id: str, boot_id: str, seq: int, t_ns: int) -> Registration:
+        """The present estimates."""
+        found = self.biases.messages() if self.biases is not None else []
+        return Registration(
+            unit_id=unit_id, boot_id=boot_id, seq=seq, t_ns=t_ns, sensors=[_message(one) for one in found]
+        )
+
+    def record(self, t_ns: int) -> RegistrationRecord | None:
+        """All that the next start should know, as of a time."""
+        if self.biases is None:
+            return None
+        snapshot = self.biases.snapshot()
+        state = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in snapshot.items()}
+        return RegistrationRecord(t_ns=t_ns, state=state)
+
+    def restore(self, record: RegistrationRecord, now_ns: int) -> RegistrationRecord | None:
+        """Go on from what an earlier run knew, before the first sensor; what is left of that now.
+
+        Raises:
+            TrackmeshError: the record is none of this version.
+        """
+        if self.biases is None:
+            return None
+        try:
+            self.biases.restore(record.state, max(0.0, (now_ns - record.t_ns) / 1e9))
+        except ValueError as error:
+            raise TrackmeshError(f"The registration of the last run cannot be used: {error}.") from None
+        return self.record(now_ns)
+
+
+def _message(estimate: Estimate) -> SensorBias:
+    return SensorBias(
+        sensor_id=estimate.sensor_id,
+        columns=estimate.columns,
+        bias=estimate.bias,
+        covariance=estimate.covariance,
+        locked=estimate.locked,
+        pairs=estimate.pairs,
+        jumps=estimate.jumps,
+        notes=estimate.notes,
+    )
