@@ -20,6 +20,7 @@ from trackmesh.protocol.messages import (
     Envelope,
     HistoryQuery,
     PlotBatch,
+    Registration,
     SensorInfo,
     ServiceStatus,
     TrackFrame,
@@ -320,6 +321,15 @@ def test_statuses_of_those_alive(bus: MemoryBus, client: Client) -> None:
     for kind, unit in (("fusion", "west"), ("emi", "a"), ("sensor", "north")):
         bus.declare_alive(client.keys.live(kind, unit))
     assert client.statuses() == [status("emi", "a"), status("fusion", "west")]
+
+
+def test_registrations_of_units_that_are_alive(bus: MemoryBus, client: Client) -> None:
+    told = [Registration(unit_id=unit, boot_id="b", seq=0, t_ns=0, sensors=[]) for unit in ("east", "gone", "west")]
+    for one in told:
+        bus.publisher(client.keys.registration(one.unit_id), history=1).put(encode(one), encoding(one))
+    for unit in ("west", "east", "mute"):
+        bus.declare_alive(client.keys.live("fusion", unit))
+    assert client.registrations(timeout_s=0.05) == [told[0], told[2]]
 
 
 def test_a_service_without_status_does_not_hold_up_the_others(bus: MemoryBus, client: Client) -> None:

@@ -216,6 +216,17 @@ class Client:
                     heard[status.kind, status.unit_id] = status
         return [heard[who] for who in sorted(heard) if who in wanted]
 
+    def registrations(self, *, timeout_s: float = 0.5) -> list[Registration]:
+        """What the units that are alive think of their sensors, ordered by unit; silent ones are left out."""
+        wanted = {unit for _, unit in self.alive("fusion")}
+        heard: dict[str, Registration] = {}
+        deadline = time.monotonic() + timeout_s
+        with self.watch_registration() as watch:
+            while wanted - heard.keys() and (left_s := deadline - time.monotonic()) > 0:
+                if (one := watch.receive(left_s)) is not None:
+                    heard[one.unit_id] = one
+        return [heard[unit] for unit in sorted(heard) if unit in wanted]
+
     def alive(self, kind: str = "*") -> list[tuple[str, str]]:
         """Kind and id of the sensors and services that are alive, ordered."""
         return [kind_and_id(key) for key in self.bus.alive(self.keys.live(kind, "*"))]

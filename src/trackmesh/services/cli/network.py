@@ -122,13 +122,18 @@ def tracks(
 
 @told
 def sensors(as_json: AsJson = False, config: Config = None, connect: Connect = None, realm: Realm = None) -> None:
-    """List the sensors that are there."""
+    """List the sensors that are there, and what the fusion units think is wrong with them."""
     with client(connect, realm, config) as ask:
         found, alive = ask.sensors(), {ident for _, ident in ask.alive("sensor")}
+        biases = {bias.sensor_id: bias for one in ask.registrations() for bias in one.sensors}
     if as_json:
-        print(json.dumps([s.model_dump(mode="json") | {"alive": s.sensor_id in alive} for s in found]))
+        rows = []
+        for s in found:
+            bias = biases[s.sensor_id].model_dump(mode="json") if s.sensor_id in biases else None
+            rows.append(s.model_dump(mode="json") | {"alive": s.sensor_id in alive, "registration": bias})
+        print(json.dumps(rows))
     else:
-        out.print(sensor_table(found, alive))
+        out.print(sensor_table(found, alive, biases))
 
 
 @told

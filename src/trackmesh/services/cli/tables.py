@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
+import numpy as np
 from rich.table import Table
 
-from trackmesh.protocol.messages import EmiResult, SensorInfo, ServiceStatus, TrackFrame
+from trackmesh.protocol.messages import EmiResult, SensorBias, SensorInfo, ServiceStatus, TrackFrame
 
 STATUS_NAMES = ("tentative", "confirmed", "coasting", "ended")
 
@@ -55,10 +56,10 @@ def _track_row(frame: TrackFrame, row: int) -> list[str]:
     ]
 
 
-def sensor_table(sensors: Iterable[SensorInfo], alive: set[str]) -> Table:
+def sensor_table(sensors: Iterable[SensorInfo], alive: set[str], biases: Mapping[str, SensorBias]) -> Table:
     """One row a sensor."""
     table = Table(title="Sensors", title_justify="left")
-    for name in ("sensor", "alive", "kind", "site", "period s", "range km", "P detect", "sigma"):
+    for name in ("sensor", "alive", "kind", "site", "period s", "range km", "P detect", "sigma", "bias"):
         table.add_column(name)
     for s in sensors:
         site = "-"
@@ -77,8 +78,23 @@ def sensor_table(sensors: Iterable[SensorInfo], alive: set[str]) -> Table:
             f"{s.max_range_m / 1e3:g}",
             f"{s.p_detect:g}",
             sigma,
+            bias_text(biases[s.sensor_id]) if s.sensor_id in biases else "-",
         )
     return table
+
+
+def bias_text(bias: SensorBias) -> str:
+    """``range 148 ± 9 m, azimuth 0.39 ± 0.01 deg``; in brackets where plots are not corrected by it."""
+    sigma = np.sqrt(np.diag(bias.covariance))
+    parts = []
+    for name, value, error in zip(bias.columns, bias.bias.tolist(), sigma.tolist(), strict=True):
+        what, _, unit = name.rpartition("_")
+        if unit == "rad":
+            parts.append(f"{what} {np.rad2deg(value):.2f} ± {np.rad2deg(error):.2f} deg")
+        else:
+            parts.append(f"{what} {value:.0f} ± {error:.0f} {unit}")
+    text = ", ".join(parts)
+    return text if bias.locked else f"({text})"
 
 
 def status_table(statuses: Iterable[ServiceStatus]) -> Table:
