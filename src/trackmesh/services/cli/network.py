@@ -122,7 +122,7 @@ def tracks(
 
 @told
 def sensors(as_json: AsJson = False, config: Config = None, connect: Connect = None, realm: Realm = None) -> None:
-    """List the sensors that are there, and what the fusion units think is wrong with them."""
+    """List the sensors that are there, and their biases."""
     with client(connect, realm, config) as ask:
         found, alive = ask.sensors(), {ident for _, ident in ask.alive("sensor")}
         biases = {bias.sensor_id: bias for one in ask.registrations() for bias in one.sensors}
