@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -102,7 +103,7 @@ class AssociationCycle:
         known = self._registration
         if known is None:
             return None
-        return lambda at_a, at_b: known.difference(a, b, at_a, at_b)[1]
+        return partial(known.difference_covariance, a, b)
 
     def _teach(self, a: str, b: str, of_a: LocalTracks, of_b: LocalTracks, pairs: DeclaredPairs, now_s: float) -> None:
         if self._registration is not None and len(pairs.a):

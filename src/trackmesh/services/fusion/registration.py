@@ -127,9 +127,12 @@ class Registration:
         By the present estimate, locked or not: what is badly known widens the gate. ``at_a`` and ``at_b``, (n, 2) or
         (n, 4), are the raw tracks of the pairs.
         """
-        i, j = self._index[a], self._index[b]
-        mean = self._filter.shift(i, at_a) - self._filter.shift(j, at_b)
-        return mean, self._filter.difference_covariance(i, at_a, j, at_b)
+        mean = self._filter.shift(self._index[a], at_a) - self._filter.shift(self._index[b], at_b)
+        return mean, self.difference_covariance(a, b, at_a, at_b)
+
+    def difference_covariance(self, a: str, b: str, at_a: FloatArray, at_b: FloatArray) -> FloatArray:
+        """The covariance of ``difference`` alone, for whoever has both shifts already."""
+        return self._filter.difference_covariance(self._index[a], at_a, self._index[b], at_b)
 
     # --- what it learns from ---
 
