@@ -69,12 +69,7 @@ def mixtures(bank: Bank, out: Mixture) -> None:
     """Write position and velocity of all filters, model by model."""
     for k in range(len(bank.states)):
         state = bank.states[k]
-        imm.probabilities(bank.models[0], state, out.mu[k])
-        for j in range(len(state.mu)):
-            for a in range(4):
-                out.x[k, j, a] = state.x[j, a]
-                for b in range(4):
-                    out.P[k, j, a, b] = state.P[j, a, b]
+        imm.write_mixture(bank.models[0], state, state.x, state.P, out, k)
 
 
 @kernel
@@ -82,9 +77,4 @@ def lagged(bank: Bank, lag: int, out: Mixture) -> None:
     """Write what is now known of ``lag`` plots ago (1 to ``models.lags``)."""
     for k in range(len(bank.states)):
         state = bank.states[k]
-        imm.probabilities(bank.models[0], state, out.mu[k])
-        for j in range(len(state.mu)):
-            for a in range(4):
-                out.x[k, j, a] = state.y[lag - 1, j, a]
-                for b in range(4):
-                    out.P[k, j, a, b] = state.Y[lag - 1, j, a, b]
+        imm.write_mixture(bank.models[0], state, state.y[lag - 1], state.Y[lag - 1], out, k)

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from trackmesh.services.estimation import lags, printed
 from trackmesh.services.estimation.bank import Models, State, Work
+from trackmesh.services.estimation.gating import Mixture
 from trackmesh.services.estimation.jit import kernel
 from trackmesh.services.estimation.measurement import range_rate, update_position, update_scalar
 from trackmesh.services.estimation.motion import linear_flow, predict_model
@@ -335,6 +336,17 @@ def probabilities(models: Models, s: State, out: FloatArray) -> None:
     for branch in range(len(models.split_s)):
         for j in range(models.first[branch], models.first[branch + 1]):
             out[j] = s.weight[branch] * s.mu[j]
+
+
+@kernel
+def write_mixture(models: Models, s: State, x: FloatArray, P: FloatArray, out: Mixture, k: int) -> None:
+    """Write position and velocity of a filter, model by model, as mixture ``k``: x (r, >= 4), P (r, >= 4, >= 4)."""
+    probabilities(models, s, out.mu[k])
+    for j in range(len(models.kind)):
+        for a in range(4):
+            out.x[k, j, a] = x[j, a]
+            for b in range(4):
+                out.P[k, j, a, b] = P[j, a, b]
 
 
 @kernel

@@ -141,12 +141,7 @@ def predict(models: Models, f: Filters, rows: IntArray, t_s: FloatArray, out: Mi
             known[k] = False
             continue
         imm.interact(models, state, t_s[k], f.work)
-        imm.probabilities(models, state, out.mu[k])
-        for j in range(len(models.kind)):
-            for a in range(4):
-                out.x[k, j, a] = state.x[j, a]
-                for b in range(4):
-                    out.P[k, j, a, b] = state.P[j, a, b]
+        imm.write_mixture(models, state, state.x, state.P, out, k)
     return known
 
 
@@ -157,12 +152,7 @@ def refined(models: Models, f: Filters, rows: IntArray, lag: int, out: Mixture) 
     for k in range(len(rows)):
         state = f.head[rows[k]]
         t_s[k] = state.y_t_s[lag - 1]
-        imm.probabilities(models, state, out.mu[k])
-        for j in range(len(models.kind)):
-            for a in range(4):
-                out.x[k, j, a] = state.y[lag - 1, j, a]
-                for b in range(4):
-                    out.P[k, j, a, b] = state.Y[lag - 1, j, a, b]
+        imm.write_mixture(models, state, state.y[lag - 1], state.Y[lag - 1], out, k)
     return t_s
 
 
