@@ -212,14 +212,14 @@ def chain(G: FloatArray, dt_s: float) -> FloatArray:
     """The transition matrix of a generator, by the kernel."""
     r = len(G)
     out = np.empty((r, r))
-    transition_matrix(*uniformised(G, r), dt_s, out, np.empty((3, r, r)))
+    transition_matrix(*uniformised(G, r), dt_s, out, np.empty((r, r)))
     return out
 
 
 def chain_matrix(models: Models, dt_s: float, branch: int = 0) -> FloatArray:
     """The fixed transition matrix of a branch, by scipy's matrix exponential."""
     n = int(models.first[branch + 1] - models.first[branch])
-    G = models.rate[branch] * (models.jump[branch, :n, :n] - np.eye(n))
+    G = models.rate[branch] * (models.jump[branch, 0, :n, :n] - np.eye(n))
     return np.asarray(scipy.linalg.expm(G * dt_s))
 
 
@@ -276,21 +276,22 @@ def fresh_filters(models: Models, first: Plot, rows: int = 1, ring: int = 6) -> 
 
 
 def begin_row(models: Models, f: Filters, row: int, plot: Plot, sigma_v_mps: float = 150.0) -> None:
-    tracks.begin(models, f, np.array([row]), batch(plot), sigma_v_mps)
+    tracks.begin(f, np.array([row]), batch(plot), sigma_v_mps)
 
 
 def feed_row(models: Models, f: Filters, row: int, plot: Plot) -> bool:
-    return bool(tracks.feed(models, f, np.array([row]), batch(plot))[0])
+    return bool(tracks.feed(f, np.array([row]), batch(plot))[0])
 
 
 def copied(f: Filters) -> Filters:
-    return f._replace(**{name: getattr(f, name).copy() for name in Filters._fields[:7]})
+    return f._replace(**{name: getattr(f, name).copy() for name in Filters._fields if name not in ("models", "work")})
 
 
 def meaning(f: Filters, row: int) -> list[bytes]:
     """All that a row holds; of the ring only the plots in use."""
-    rest = (f.head, f.base, f.ring_n, f.t_s, f.mean, f.spread)
-    return [f.ring[row, : f.ring_n[row]].tobytes(), *(a[row].tobytes() for a in rest)]
+    rest = (f.head, f.base, f.ring_n, f.mid_n, f.t_s, f.mean, f.spread)
+    mid = [f.mid[row].tobytes()] if f.mid_n[row] else []
+    return [f.ring[row, : f.ring_n[row]].tobytes(), *mid, *(a[row].tobytes() for a in rest)]
 
 
 def same(one: Filters, other: Filters, row: int = 0, other_row: int | None = None) -> bool:
@@ -298,10 +299,15 @@ def same(one: Filters, other: Filters, row: int = 0, other_row: int | None = Non
     return meaning(one, row) == meaning(other, row if other_row is None else other_row)
 
 
+def same_present(one: Filters, other: Filters) -> bool:
+    """Whether the present of all rows is equal bit for bit, wherever their bases stand."""
+    return all(getattr(one, n).tobytes() == getattr(other, n).tobytes() for n in ("head", "t_s", "mean", "spread"))
+
+
 def predicted(models: Models, f: Filters, rows: IntArray, t_s: FloatArray) -> tuple[Mixture, npt.NDArray[np.bool_]]:
     """Predictions of rows, and which are known."""
     out = make_mixture(len(rows), len(models.kind))
-    known = tracks.predict(models, f, rows, t_s, out)
+    known = tracks.predict(f, rows, t_s, out)
     return out, known
 
 

@@ -8,6 +8,7 @@ from tests.services.estimation.makers import (
     LAW,
     FloatArray,
     H,
+    IntArray,
     Plot,
     assert_covariance,
     batch,
@@ -22,7 +23,7 @@ from tests.services.estimation.makers import (
 from trackmesh.services.estimation import alpha_beta as ab
 from trackmesh.services.estimation import gating
 from trackmesh.services.estimation.alpha_beta_tracks import AlphaBetaTracks
-from trackmesh.services.estimation.plots import make_plots
+from trackmesh.services.estimation.plots import Plots, make_plots
 
 SIGMA_V, ACCELERATION = 150.0, 5.0
 ROW = np.array([0])
@@ -213,6 +214,11 @@ def test_rows_are_added_behind_those_that_are_there() -> None:
         assert np.array_equal(got, want)
 
 
+def _near(tracks: AlphaBetaTracks, rows: IntArray, plots: Plots, limit: float) -> IntArray:
+    own = tracks._rows
+    return gating.near(own.x, own.spread, own.t_s, rows, plots, limit, tracks._strength)
+
+
 @LAW
 @given(seeds, st.floats(0.0, 20.0))
 def test_no_track_with_a_plot_in_its_gate_is_left_out(seed: int, wait: float) -> None:
@@ -232,7 +238,7 @@ def test_no_track_with_a_plot_in_its_gate_is_left_out(seed: int, wait: float) ->
     plots = make_plots(ahead.x[row, 0, :2] + edge, packed(R), t_s[0])
     inside, _, _ = gating.gate(ahead, t_s, plots, limit)
     assert row in inside
-    assert set(inside.tolist()) <= set(tracks.near(rows, plots, limit).tolist())
+    assert set(inside.tolist()) <= set(_near(tracks, rows, plots, limit).tolist())
 
 
 def test_a_target_that_flies_as_supposed_is_followed_as_well_as_said() -> None:

@@ -40,7 +40,7 @@ def test_the_chain_of_each_branch_stands_by_itself() -> None:
     """The shorter branch is filled up with models that are never left."""
     for b, branch in enumerate((MANOEUVRE, GENERIC)):
         n = len(branch.models)
-        G = TVIMM.rate[b] * (TVIMM.jump[b] - np.eye(5))
+        G = TVIMM.rate[b] * (TVIMM.jump[b, 0] - np.eye(5))
         np.testing.assert_allclose(G[:n, :n], generator(np.array(branch.sojourn_s), branch.jumps), atol=1e-16)
         assert not G[n:].any()
         assert not G[:, n:].any()

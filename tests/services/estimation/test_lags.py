@@ -31,7 +31,7 @@ from tests.services.estimation.makers import (
     noise,
     random_state,
     random_walk,
-    same,
+    same_present,
     seeds,
     unpacked,
     velocities,
@@ -209,7 +209,7 @@ def test_present_and_past_have_one_covariance(models: Models, seed: int) -> None
 def test_late_plots_give_the_lags_of_the_right_order(models: Models, seed: int) -> None:
     rng = np.random.default_rng(seed)
     plots = random_walk(rng, 14)
-    in_order, late = (fresh_filters(models, plots[0]) for _ in range(2))
+    in_order, late = (fresh_filters(models, plots[0], ring=12) for _ in range(2))
     order = list(range(1, 14))
     for _ in range(4):
         k = int(rng.integers(0, 9))
@@ -217,7 +217,7 @@ def test_late_plots_give_the_lags_of_the_right_order(models: Models, seed: int) 
     for k in range(1, 14):
         assert feed_row(models, in_order, 0, plots[k])
         assert feed_row(models, late, 0, plots[order[k - 1]])
-    assert same(late, in_order)
+    assert same_present(late, in_order)
     assert late.head[0].y_t_s.tolist() == [plots[-2].t_s, plots[-3].t_s]
 
 
@@ -279,7 +279,7 @@ def test_what_a_row_was_is_told_with_its_time() -> None:
         feed_row(TVIMM_LAGGED, f, 0, plot)
     for lag in (1, 2):
         out = make_mixture(1, 8)
-        t_s = tracks.refined(TVIMM_LAGGED, f, np.array([0]), lag, out)
+        t_s = tracks.refined(f, np.array([0]), lag, out)
         assert t_s.tolist() == [plots[-1 - lag].t_s]
         assert np.array_equal(out.x[0], f.head[0].y[lag - 1])
         assert np.array_equal(out.P[0], f.head[0].Y[lag - 1])

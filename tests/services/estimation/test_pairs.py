@@ -61,6 +61,18 @@ def test_the_increment_is_the_ratio_of_student_t_to_unrelated_tracks(seed: int, 
     assert got[0] == pytest.approx(related - np.log(rho[0]) - speed, abs=1e-8)
 
 
+@LAW
+@given(seeds)
+def test_infinite_degrees_of_freedom_are_the_gaussian_density(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    (xa, Pa), (xb, Pb), zero = states(rng, 1), states(rng, 1), np.zeros(1, np.int64)
+    found = state_distances(xa, Pa, xb, Pb, zero, zero, np.zeros((1, 2, 2)))
+    got, nearly = (log_ratio(UNCLIPPED._replace(nu=nu), *found, np.ones(1)) for nu in (np.inf, 1e9))
+    related = scipy.stats.multivariate_normal(np.zeros(4), (Pa + Pb)[0]).logpdf((xa - xb)[0])
+    assert got[0] == pytest.approx(related + np.log(4 * np.pi * UNCLIPPED.speed_mps**2), rel=1e-9, abs=1e-8)
+    assert nearly[0] == pytest.approx(got[0], rel=1e-4, abs=1e-4)
+
+
 def test_increments_are_clipped() -> None:
     rules = PairRules()
     got = log_ratio(rules, np.array([0.0, 1e12, np.inf]), np.zeros(3), np.full(3, 1e-9))

@@ -24,9 +24,9 @@ from tests.services.estimation.makers import (
 
 from trackmesh.services.estimation import imm
 from trackmesh.services.estimation.bank import Models, State, Work, make_work
+from trackmesh.services.estimation.imm_tracks import ImmTracks
 from trackmesh.services.estimation.jit import kernel
 from trackmesh.services.estimation.plots import Plots
-from trackmesh.services.estimation.tracks import ImmTracks
 
 FILTERS = {"imm": MODELS, "tvimm": TVIMM, "imm with lags": LAGGED, "tvimm with lags": TVIMM_LAGGED}
 

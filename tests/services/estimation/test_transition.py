@@ -106,6 +106,9 @@ def test_a_uniformised_chain_jumps_at_one_rate(tau: FloatArray, more: int) -> No
     r = len(tau)
     U, rate = uniformised(generator(tau), r + more)
     assert np.all(U >= 0)
+    U, U2, U3 = U
     np.testing.assert_allclose(U.sum(axis=1), 1.0, atol=1e-15)
+    np.testing.assert_allclose(U2, U @ U, atol=1e-15)
+    np.testing.assert_allclose(U3, U @ U2, atol=1e-15)
     np.testing.assert_allclose(rate * (U[:r, :r] - np.eye(r)), generator(tau), rtol=1e-12, atol=1e-15)
     assert np.array_equal(U[r:], np.eye(r + more)[r:])

@@ -14,8 +14,8 @@ from trackmesh.protocol.codec import decode, encode
 from trackmesh.protocol.messages import PlotBatch, ScanPart, SensorInfo, TrackFrame
 from trackmesh.services.estimation.bank import make_models
 from trackmesh.services.estimation.filters import velocity_models
+from trackmesh.services.estimation.imm_tracks import ImmTracks
 from trackmesh.services.estimation.plots import Plots, make_plots
-from trackmesh.services.estimation.tracks import ImmTracks
 from trackmesh.services.fusion.engine import FusionEngine, Unit
 from trackmesh.services.fusion.layer import Layer, Look
 from trackmesh.services.fusion.life import Rules

@@ -34,7 +34,7 @@ from tests.services.fusion.makers import (
 from trackmesh.protocol.codec import decode, encode
 from trackmesh.protocol.messages import PlotBatch, RefinedFrame, TrackFrame, TrackQuery
 from trackmesh.services.estimation.alpha_beta_tracks import AlphaBetaTracks
-from trackmesh.services.estimation.tracks import ImmTracks
+from trackmesh.services.estimation.imm_tracks import ImmTracks
 from trackmesh.services.fusion.engine import FusionEngine
 from trackmesh.services.fusion.settings import EngineSettings
 

@@ -121,7 +121,7 @@ def test_the_past_within_the_ring_is_what_was_told_then() -> None:
 def test_before_the_ring_there_is_no_answer_and_no_error() -> None:
     tracker = engine(NORTH, ring_system=4)
     drive(tracker, scans(NORTH, FAR_APART, 80.0))
-    assert len(ids(tracker.query(TrackQuery(at_t_ns=ns(60.0))))) == 4
+    assert len(ids(tracker.query(TrackQuery(at_t_ns=ns(74.0))))) == 4
     assert not ids(tracker.query(TrackQuery(at_t_ns=ns(30.0))))
     assert not ids(tracker.query(TrackQuery(at_t_ns=0)))
 

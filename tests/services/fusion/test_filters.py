@@ -22,7 +22,7 @@ from tests.services.fusion.makers import (
 from trackmesh.protocol.messages import PlotBatch, TrackFrame
 from trackmesh.services.estimation.bank import Models
 from trackmesh.services.estimation.filters import FilterName
-from trackmesh.services.estimation.tracks import ImmTracks
+from trackmesh.services.estimation.imm_tracks import ImmTracks
 from trackmesh.services.fusion.settings import EngineSettings
 
 FILTERS = get_args(FilterName)
@@ -97,4 +97,4 @@ def test_words_of_the_user_reach_the_models(quiet_s: float) -> None:
     assert models.numbers[3, 2] == pytest.approx(24.0)
     assert models.numbers[0, 0] == pytest.approx(1.0)
     # Quiet flight is left at the rate of its sojourn time.
-    assert models.rate[0] * (models.jump[0, 0, 0] - 1.0) == pytest.approx(-1.0 / (1.2 * quiet_s))
+    assert models.rate[0] * (models.jump[0, 0, 0, 0] - 1.0) == pytest.approx(-1.0 / (1.2 * quiet_s))

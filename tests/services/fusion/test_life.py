@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from tests.services.fusion.makers import RULES, IntArray
 
+from trackmesh.services.estimation.plots import make_plots
 from trackmesh.services.fusion import life as lives
 from trackmesh.services.fusion.life import NEVER, Life, Rules, make_life
 
@@ -18,7 +19,8 @@ def begun(t_s: float = 0.0, n: int = 1, sensors: int = 2) -> Life:
 
 
 def hit(life: Life, t_s: float, gain: float = 5.0, sensor: int = 0) -> None:
-    lives.hit(life, RULES, ROW, np.array([t_s]), np.array([gain]), sensor)
+    plot = make_plots([[0.0, 0.0]], [1.0, 0.0, 1.0], t_s)
+    lives.hit(life, RULES, ROW, np.array([True]), plot, np.array([gain]), sensor)
 
 
 def miss(life: Life, t_s: float, *, whole: bool = True, lately_s: float = np.inf, east_m: float = 1e4) -> bool:

@@ -11,7 +11,7 @@ from matplotlib.image import imread
 from trackmesh.protocol.errors import TrackmeshError
 from trackmesh.services.estimation.bank import Models
 from trackmesh.services.estimation.filters import FilterName
-from trackmesh.services.estimation.tracks import ImmTracks
+from trackmesh.services.estimation.imm_tracks import ImmTracks
 from trackmesh.services.fusion.settings import EngineSettings
 from trackmesh.sim.studies import tvimm, tvimm_benchmark
 from trackmesh.sim.studies.result import StudyResult
@@ -39,7 +39,7 @@ def served(name: FilterName) -> Models:
 
 def generator(models: Models) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     r = len(models.kind)
-    return np.asarray(models.rate[0] * (models.jump[0] - np.eye(r)))
+    return np.asarray(models.rate[0] * (models.jump[0, 0] - np.eye(r)))
 
 
 @pytest.mark.parametrize("name", SETS)

@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from trackmesh.services.estimation import gating
 from trackmesh.services.estimation.alpha_beta import combined_gains, manoeuvring_index
-from trackmesh.services.estimation.gating import Mixture, Strength, make_mixture, near
+from trackmesh.services.estimation.gating import Mixture, Strength, make_mixture
 from trackmesh.services.estimation.jit import kernel
 from trackmesh.services.estimation.plots import Plot, Plots, empty_plots
 
@@ -184,15 +185,33 @@ class AlphaBetaTracks:
     def move_plots(self, sensor: int, move: Callable[[FloatArray], FloatArray]) -> None:
         """Nothing: no plots are remembered."""
 
-    def near(self, rows: IntArray, plots: Plots, limit: float) -> IntArray:
-        """The rows that may have a plot in their gate."""
-        return near(self._rows.x, self._rows.spread, self._rows.t_s, rows, plots, limit, self._strength)
+    def associate(
+        self, rows: IntArray, first: BoolArray, plots: Plots, limit: float
+    ) -> tuple[IntArray, FloatArray, BoolArray]:
+        """Give plots to rows, one to one: (m,) row of each plot or -1, cost, and whether it was not too late."""
+        m = len(plots)
+        row, cost, fed = np.full(m, -1, np.int64), np.zeros(m), np.zeros(m, np.bool_)
+        own = self._rows
+        near = gating.near(own.x, own.spread, own.t_s, rows, plots, limit, self._strength)
+        times = gating.nearest_times(own.x[near], own.t_s[near], plots)
+        ahead, known = self.predict(near, times)
+        near, times, ahead = near[known], times[known], Mixture(*(part[known] for part in ahead))
+        chosen = gating.choose(ahead, times, first[near], plots, limit, cost)
+        taken = np.flatnonzero(chosen >= 0)
+        row[taken] = near[chosen[taken]]
+        fed[taken] = self.feed(row[taken], plots[taken])
+        return row, cost, fed
 
     def predict(self, rows: IntArray, t_s: FloatArray) -> tuple[Mixture, BoolArray]:
         """Predictions of rows to their times, and which of them are known."""
         out = make_mixture(len(rows), 1)
         known = _predict(self._rows, rows, t_s, self._acceleration_mps2, out)
         return out, known
+
+    def estimate(self, rows: IntArray, t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Predictions of rows to their times: means (m, 4), covariances (m, 4, 4), model probabilities (m, 1)."""
+        ahead, _ = self.predict(rows, t_s)
+        return ahead.x[:, 0], ahead.P[:, 0], ahead.mu
 
     def estimates(self, mixture: Mixture) -> tuple[FloatArray, FloatArray]:
         """The only model's mean (m, 4) and covariance (m, 4, 4)."""

@@ -54,7 +54,8 @@ class Models(Protocol):
     Attributes:
         kind, states: (r,). numbers: (r, 4) q, mean, sd, time_s.
         first: (b + 1,) first model of each branch, and r.
-        jump, rate: (b, width, width), (b,): each branch's chain, uniformised; width is that of the longest branch.
+        jump, rate: (b, 3, width, width), (b,): each branch's chain, uniformised, and its powers; width is that of the
+            longest branch.
         start: (r,) initial probabilities, summing to one in each branch.
         prior_count: (b,). age_s: (r,), 0 where a model has no memory of its age.
         split_s: (b,).
@@ -214,7 +215,7 @@ class Work(Protocol):
 
     Attributes:
         pi: (r, width) transition matrix of each branch, one below the other. step: (width, width) of one.
-        weight: (width, width) share of model a in what comes to model j. powers, F, product, block, gain: scratch.
+        weight: (width, width) share of model a in what comes to model j. power, F, product, block, gain: scratch.
         x, P, y, C, Y: (width, ...) what mixing gives.
         before, c, log_likelihood: (r,).
         repairs: how often a covariance that was none had to be replaced.
@@ -223,7 +224,7 @@ class Work(Protocol):
     pi: FloatArray
     step: FloatArray
     weight: FloatArray
-    powers: FloatArray
+    power: FloatArray
     F: FloatArray
     product: FloatArray
     block: FloatArray
@@ -246,7 +247,7 @@ def make_work(models: Models) -> Work:
         "pi": (r, width),
         "step": (width, width),
         "weight": (width, width),
-        "powers": (3, width, width),
+        "power": (width, width),
         "F": (6, 6),
         "product": (6, 6),
         "block": (6,),
@@ -265,4 +266,4 @@ def make_work(models: Models) -> Work:
 
 def _sizes(models: Models) -> tuple[int, int, int, int, int]:
     """Numbers r of models, of the longest branch, b of branches, d of states, of lags."""
-    return len(models.kind), models.jump.shape[1], len(models.split_s), int(models.states.max()), int(models.lags)
+    return len(models.kind), models.jump.shape[2], len(models.split_s), int(models.states.max()), int(models.lags)

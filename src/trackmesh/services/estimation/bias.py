@@ -20,6 +20,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from trackmesh.services.estimation.jit import kernel
+
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
@@ -44,15 +46,35 @@ def shift(geometry: Geometry, at: FloatArray, bias: FloatArray) -> FloatArray:
         at: (..., 2) measured positions, or (..., 4) with velocities, without which the time offset does nothing.
         bias: (..., 3), broadcast against ``at``.
     """
-    if geometry.polar:
-        east, north = np.moveaxis(at[..., :2] - geometry.site_m, -1, 0)
-        r = np.maximum(np.hypot(east, north), _LEAST_RANGE_M)
-        stretch = np.maximum(r - bias[..., 0], 0.0) / r
-        cos, sin = stretch * np.cos(bias[..., 1]), stretch * np.sin(bias[..., 1])
-        moved = np.stack([east - (east * cos - north * sin), north - (north * cos + east * sin)], axis=-1)
-    else:
-        moved = np.broadcast_to(bias[..., :2], (*np.broadcast_shapes(at.shape[:-1], bias.shape[:-1]), 2))
-    return np.asarray(moved + bias[..., 2:] * at[..., 2:] if at.shape[-1] == 4 else moved)
+    lead = at.shape[:-1] if bias.ndim == 1 else np.broadcast_shapes(at.shape[:-1], bias.shape[:-1])
+    width = at.shape[-1]
+    if at.shape[:-1] != lead:
+        at = np.broadcast_to(at, (*lead, width))
+    if bias.ndim > 1:
+        bias = np.broadcast_to(bias, (*lead, COMPONENTS))
+    rows, biases = at.reshape(-1, width), bias.reshape(-1, COMPONENTS)
+    return _shift(geometry.polar, geometry.site_m, rows, biases).reshape(*lead, 2)
+
+
+@kernel
+def _shift(polar: bool, site_m: FloatArray, at: FloatArray, bias: FloatArray) -> FloatArray:
+    """``shift`` of rows (n, 2 or 4) by biases (n, 3), or (1, 3) for all."""
+    n, width = at.shape
+    out = np.empty((n, 2))
+    for k in range(n):
+        b = bias[k] if len(bias) > 1 else bias[0]
+        if polar:
+            east, north = at[k, 0] - site_m[0], at[k, 1] - site_m[1]
+            r = max(np.hypot(east, north), _LEAST_RANGE_M)
+            stretch = max(r - b[0], 0.0) / r
+            cos, sin = stretch * np.cos(b[1]), stretch * np.sin(b[1])
+            out[k, 0], out[k, 1] = east - (east * cos - north * sin), north - (north * cos + east * sin)
+        else:
+            out[k, 0], out[k, 1] = b[0], b[1]
+        if width == 4:
+            out[k, 0] += b[2] * at[k, 2]
+            out[k, 1] += b[2] * at[k, 3]
+    return out
 
 
 def corrected(geometry: Geometry, at: FloatArray, bias: FloatArray) -> FloatArray:
@@ -75,17 +97,42 @@ def jacobian(geometry: Geometry, at: FloatArray) -> FloatArray:
     At the corrected position it is the derivative of ``measured - corrected(measured, bias)`` by the biases (exact
     without time offset, with it but for what the target moves in that time).
     """
-    J = np.zeros((*at.shape[:-1], 2, COMPONENTS))
-    if geometry.polar:
-        east, north = np.moveaxis(at[..., :2] - geometry.site_m, -1, 0)
-        r = np.maximum(np.hypot(east, north), _LEAST_RANGE_M)
-        J[..., 0, 0], J[..., 1, 0] = east / r, north / r
-        J[..., 0, 1], J[..., 1, 1] = north, -east
-    else:
-        J[..., 0, 0] = J[..., 1, 1] = 1.0
-    if at.shape[-1] == 4:
-        J[..., 2] = at[..., 2:]
+    rows = at.reshape(-1, at.shape[-1])
+    return _jacobian(geometry.polar, geometry.site_m, rows).reshape(*at.shape[:-1], 2, COMPONENTS)
+
+
+@kernel
+def _jacobian(polar: bool, site_m: FloatArray, at: FloatArray) -> FloatArray:
+    n, width = at.shape
+    J = np.zeros((n, 2, COMPONENTS))
+    for k in range(n):
+        if polar:
+            east, north = at[k, 0] - site_m[0], at[k, 1] - site_m[1]
+            r = max(np.hypot(east, north), _LEAST_RANGE_M)
+            J[k, 0, 0], J[k, 1, 0] = east / r, north / r
+            J[k, 0, 1], J[k, 1, 1] = north, -east
+        else:
+            J[k, 0, 0] = J[k, 1, 1] = 1.0
+        if width == 4:
+            J[k, 0, 2], J[k, 1, 2] = at[k, 2], at[k, 3]
     return J
+
+
+@kernel
+def spread_through(H: FloatArray, P: FloatArray) -> FloatArray:
+    """H P H^T (n, 2, 2) of rows H (n, 2, m) and one covariance P (m, m)."""
+    n, _, m = H.shape
+    out = np.zeros((n, 2, 2))
+    for k in range(n):
+        for a in range(2):
+            for i in range(m):
+                if H[k, a, i] == 0.0:
+                    continue
+                for j in range(m):
+                    for b in range(2):
+                        out[k, a, b] += H[k, a, i] * P[i, j] * H[k, b, j]
+        out[k, 0, 1] = out[k, 1, 0] = 0.5 * (out[k, 0, 1] + out[k, 1, 0])
+    return out
 
 
 def spread(P: FloatArray, polar: bool, at_range_m: float) -> float:
@@ -171,7 +218,7 @@ def positive_definite(R: FloatArray) -> BoolArray:
 
 def distances(left: FloatArray, H: FloatArray, P: FloatArray, R: FloatArray) -> FloatArray:
     """D = e^T (H P H^T + R)^-1 e of rows: e (n, 2), H (n, 2, 6), P (6, 6), R (n, 2, 2)."""
-    w = whitened(H @ P @ np.swapaxes(H, 1, 2) + R, left[:, :, None])
+    w = whitened(spread_through(H, P) + R, left[:, :, None])
     return np.asarray((w * w).sum(axis=(1, 2)))
 
 
@@ -196,6 +243,7 @@ def repetition(since_s: float, correlation_s: float) -> float:
 # --- the filter ---
 
 
+@kernel
 def learn(
     beta: FloatArray, P: FloatArray, precision: FloatArray, vector: FloatArray
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
@@ -209,13 +257,17 @@ def learn(
         numpy.linalg.LinAlgError: P is no covariance.
     """
     free = np.flatnonzero(np.diag(P) > 0.0)
-    some = np.ix_(free, free)
-    L = np.linalg.cholesky(P[some])
-    C = np.linalg.cholesky(np.eye(len(free)) + L.T @ precision[some] @ L)
+    L = np.linalg.cholesky(P[free][:, free])
+    information = precision[free][:, free]
+    C = np.linalg.cholesky(np.eye(len(free)) + L.T @ information @ L)
     W = np.linalg.solve(C, L.T)
     new_P, new_beta = np.zeros_like(P), beta.copy()
-    new_P[some] = mirrored(W.T @ W)
-    new_beta[free] += new_P[some] @ (vector - precision @ beta)[free]
+    of_free = W.T @ W
+    gain = of_free @ (vector - precision @ beta)[free]
+    for a in range(len(free)):
+        new_beta[free[a]] += gain[a]
+        for b in range(a + 1):
+            new_P[free[a], free[b]] = new_P[free[b], free[a]] = of_free[a, b]
     return new_beta, new_P
 
 

@@ -92,13 +92,12 @@ class BiasFilter:
 
     def shift_covariance(self, k: int, at: FloatArray) -> FloatArray:
         """Covariances (n, 2, 2) of the shift."""
-        J = self._jacobian(k, at)
-        return np.asarray(J @ self.covariance(k) @ np.swapaxes(J, 1, 2))
+        return bias.spread_through(self._jacobian(k, at), self.covariance(k))
 
     def difference_covariance(self, i: int, at_i: FloatArray, j: int, at_j: FloatArray) -> FloatArray:
         """Covariances (n, 2, 2) of the difference of the shifts of two sensors."""
         H = np.concatenate([self._jacobian(i, at_i), -self._jacobian(j, at_j)], axis=2)
-        return np.asarray(H @ self._part(i, j) @ np.swapaxes(H, 1, 2))
+        return bias.spread_through(H, self._part(i, j))
 
     def spread(self, k: int, range_m: float) -> float:
         """Length of the 1-sigma error of a sensor's shift at a range."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from trackmesh.services.estimation.jit import kernel
+
 FloatArray = npt.NDArray[np.float64]
 
-_UNBIAS_ABOVE_RAD = np.deg2rad(0.5)
+_UNBIAS_ABOVE_RAD2 = float(np.deg2rad(0.5)) ** 2
 
 
 def polar_to_plane(
@@ -33,16 +35,21 @@ def polar_to_plane(
         positions (n, 2) [east_m, north_m], covariances (n, 3) [ee, en, nn] in m^2.
     """
     rho = range_m if elevation_rad is None else range_m * np.cos(elevation_rad)
-    sin, cos = np.sin(azimuth_rad), np.cos(azimuth_rad)
-    stretch = np.where(azimuth_variance_rad2 > _UNBIAS_ABOVE_RAD**2, np.exp(azimuth_variance_rad2 / 2.0), 1.0)
-    across = rho * rho * azimuth_variance_rad2
-    positions = np.stack([rho * sin, rho * cos], axis=1) * stretch[:, None]
-    covariances = np.stack(
-        [
-            range_variance_m2 * sin * sin + across * cos * cos,
-            (range_variance_m2 - across) * sin * cos,
-            range_variance_m2 * cos * cos + across * sin * sin,
-        ],
-        axis=1,
-    )
+    return _to_plane(rho, azimuth_rad, range_variance_m2, azimuth_variance_rad2)
+
+
+@kernel
+def _to_plane(
+    rho: FloatArray, azimuth_rad: FloatArray, range_variance: FloatArray, azimuth_variance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    n = len(rho)
+    positions, covariances = np.empty((n, 2)), np.empty((n, 3))
+    for k in range(n):
+        sin, cos, variance = np.sin(azimuth_rad[k]), np.cos(azimuth_rad[k]), azimuth_variance[k]
+        stretch = np.exp(variance / 2.0) if variance > _UNBIAS_ABOVE_RAD2 else 1.0
+        along, across = range_variance[k], rho[k] * rho[k] * variance
+        positions[k, 0], positions[k, 1] = rho[k] * sin * stretch, rho[k] * cos * stretch
+        covariances[k, 0] = along * sin * sin + across * cos * cos
+        covariances[k, 1] = (along - across) * sin * cos
+        covariances[k, 2] = along * cos * cos + across * sin * sin
     return positions, covariances

@@ -7,11 +7,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from trackmesh.services.estimation.assignment import assign
 from trackmesh.services.estimation.jit import kernel
 from trackmesh.services.estimation.plots import Plots
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+_SCORE_AT_ZERO = 60.0
+_CHOOSES_FIRST = 200.0
+_LEAST_SCORE = 0.01
 
 
 class Mixture(NamedTuple):
@@ -24,7 +30,7 @@ class Mixture(NamedTuple):
 
 def make_mixture(m: int, r: int) -> Mixture:
     """Room for m mixtures of r models."""
-    return Mixture(np.zeros((m, r, 4)), np.zeros((m, r, 4, 4)), np.zeros((m, r)))
+    return Mixture(np.empty((m, r, 4)), np.empty((m, r, 4, 4)), np.empty((m, r)))
 
 
 class Strength(NamedTuple):
@@ -113,7 +119,7 @@ def gate(
     for j in range(m):
         plot = plots[j]
         values[j] = plot.z[1]
-        r_max = max(r_max, plot.R[2])
+        r_max = max(r_max, plot.R[0], plot.R[2])
         late, early = max(late, plot.t_s), min(early, plot.t_s)
     order = np.argsort(values)
     north = values[order]
@@ -123,15 +129,20 @@ def gate(
     cost: FloatArray = np.empty(size)
     count = 0
     for i in range(n):
-        low, high = np.inf, -np.inf
+        span = max(abs(late - t_s[i]), abs(early - t_s[i]))
+        low = west = np.inf
+        high = east = -np.inf
         for a in range(r):
-            spread = max(abs(late - t_s[i]), abs(early - t_s[i])) * abs(x[i, a, 3])
-            reach = np.sqrt(limit * (P[i, a, 1, 1] + r_max)) + spread
+            reach = np.sqrt(limit * (P[i, a, 1, 1] + r_max)) + span * abs(x[i, a, 3])
             low, high = min(low, x[i, a, 1] - reach), max(high, x[i, a, 1] + reach)
+            reach = np.sqrt(limit * (P[i, a, 0, 0] + r_max)) + span * abs(x[i, a, 2])
+            west, east = min(west, x[i, a, 0] - reach), max(east, x[i, a, 0] + reach)
         k = np.searchsorted(north, low)
         while k < m and north[k] <= high:
             j = order[k]
             k += 1
+            if plots[j].z[0] < west or plots[j].z[0] > east:
+                continue
             value = mixture_cost(x[i], P[i], mu[i], plots[j].z, plots[j].R, plots[j].t_s - t_s[i], limit)
             if np.isinf(value):
                 continue
@@ -141,6 +152,30 @@ def gate(
             ii[count], jj[count], cost[count] = i, j, value
             count += 1
     return ii[:count], jj[:count], cost[:count]
+
+
+@kernel
+def choose(
+    tracks: Mixture, t_s: FloatArray, first: BoolArray, plots: Plots, limit: float, cost: FloatArray
+) -> IntArray:
+    """The track of each plot, or -1: one to one, the cheapest in sum, and as many pairs with ``first`` as there can be.
+
+    Args:
+        tracks: n predicted mixtures. t_s: (n,) their times. first: (n,) tracks that choose before the others.
+        plots: (m,). limit: of the gate.
+        cost: (m,) written: that of the chosen pairs.
+    """
+    i, j, pair_cost = gate(tracks, t_s, plots, limit)
+    score = np.empty(len(i))
+    for e in range(len(i)):
+        score[e] = max(_SCORE_AT_ZERO - pair_cost[e], _LEAST_SCORE)
+        if first[i[e]]:
+            score[e] += _CHOOSES_FIRST
+    chosen = assign(i, j, score, len(t_s), len(plots))
+    for e in range(len(i)):
+        if chosen[j[e]] == i[e]:
+            cost[j[e]] = pair_cost[e]
+    return chosen
 
 
 @kernel
@@ -177,6 +212,12 @@ def nearest_times(mean: FloatArray, t_s: FloatArray, plots: Plots) -> FloatArray
         mean: (n, 4) states. t_s: (n,) their times.
     """
     out = np.empty(len(mean))
+    together = True
+    for j in range(len(plots)):
+        together = together and plots[j].t_s == plots[0].t_s
+    if together:
+        out[:] = plots[0].t_s
+        return out
     for i in range(len(mean)):
         best = np.inf
         for j in range(len(plots)):

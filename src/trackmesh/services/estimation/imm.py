@@ -112,7 +112,7 @@ def step_matrix(models: Models, s: State, branch: int, dt_s: float, w: Work) -> 
             for b in range(n):
                 w.pi[a, b] = s.counts[a, b]
         return
-    transition_matrix(models.jump[branch], models.rate[branch], dt_s, w.step, w.powers)
+    transition_matrix(models.jump[branch], models.rate[branch], dt_s, w.step, w.power)
     prior = models.prior_count[branch]
     learns = np.isfinite(prior)
     for a in range(n):

@@ -25,7 +25,7 @@ class PairRules(NamedTuple):
     """Constants of the test.
 
     Attributes:
-        nu: degrees of freedom of the Student-t density.
+        nu: degrees of freedom of the Student-t density; infinite for the Gaussian one.
         speed_mps, radius_m: spread of unrelated velocities per axis; radius in which tracks are counted for rho.
         correlation_s, memory_s, fit_memory_s: tau_c, tau_f, and the memory of the sum of squared distances.
         low, high: clip of one increment.
@@ -101,8 +101,11 @@ def local_density(x: FloatArray, others: FloatArray, radius_m: float) -> FloatAr
 def log_ratio(rules: PairRules, distance: FloatArray, logdet: FloatArray, density: FloatArray) -> FloatArray:
     """The increment l of pairs, clipped."""
     nu = rules.nu
-    constant = math.lgamma((nu + 4) / 2) - math.lgamma(nu / 2) - 2 * math.log(nu * math.pi)
-    log_t = constant - 0.5 * logdet - 0.5 * (nu + 4) * np.log1p(distance / nu)
+    if math.isinf(nu):
+        log_t = -2 * math.log(2 * math.pi) - 0.5 * logdet - 0.5 * distance
+    else:
+        constant = math.lgamma((nu + 4) / 2) - math.lgamma(nu / 2) - 2 * math.log(nu * math.pi)
+        log_t = constant - 0.5 * logdet - 0.5 * (nu + 4) * np.log1p(distance / nu)
     l_new = log_t - np.log(density) + math.log(4 * math.pi * rules.speed_mps**2)
     return np.asarray(np.clip(l_new, rules.low, rules.high))
 

@@ -1,24 +1,24 @@
 """Many tracks: filters with a short memory of plots, so that late plots replay exactly.
 
-Each row holds one track: the head (the filter at its last plot), the same filter some plots ago (the base), and the
-ring of plots in between, in time order. Stored state moves only when a plot is fed; prediction is read-only, to any
-time, per track. A late plot is put into the ring at its place and the head is filtered again from the base: the result
-is what filtering in order would have given. A plot older than the base is refused.
+Each row holds one track: the head (the filter at its last plot), the same filter some plots ago (the base), the ring of
+plots in between, in time order, and the filter half way (mid). Stored state moves only when a plot is fed; prediction
+is read-only, to any time, per track. A late plot is put into the ring at its place and the head is filtered again from
+the last stored state before it: the result is what filtering in order would have given. A full ring loses its older
+half, and mid becomes the base; so at least half a ring of plots can always be replayed, and no plot is filtered twice
+unless one came late. A plot older than the base is refused.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from trackmesh.services.estimation import imm, printed
-from trackmesh.services.estimation.bank import Models, States, Work, make_states, make_work
-from trackmesh.services.estimation.gating import Mixture, Strength, make_mixture, near
+from trackmesh.services.estimation import gating, imm, printed
+from trackmesh.services.estimation.bank import Models, States, as_array, make_states, make_work
+from trackmesh.services.estimation.gating import Mixture, Strength
 from trackmesh.services.estimation.jit import kernel
-from trackmesh.services.estimation.motion import TURN
 from trackmesh.services.estimation.plots import Plot, Plots, empty_plots
 
 FloatArray = npt.NDArray[np.float64]
@@ -30,89 +30,125 @@ class Filters(NamedTuple):
     """The filters of n rows with rings of k plots; a row means nothing before ``begin``.
 
     Attributes:
-        head: at the last plot. base: before the plots of the ring.
-        ring, ring_n: (n, k) the plots; (n,) how many there are.
+        models, work: (1,) the models and the scratch of the kernels, as arrays of one record, which compiled functions
+            take faster than a record.
+        head: at the last plot. base: before the plots of the ring. mid: after the first ``mid_n`` plots of the ring;
+            it means nothing where that is 0.
+        ring, ring_n: (n, k) the plots; (n,) how many there are, always less than k.
         t_s, mean: (n,), (n, 4) time of the head, mean position and velocity.
         spread: (n, 3) greatest variance of position, its covariance with velocity, and variance of velocity, for a
             quick bound of where the track can be.
-        scratch, work: one state and the scratch of the kernels.
+        scratch: some states that mean nothing between two calls.
     """
 
+    models: npt.NDArray[Any]
+    work: npt.NDArray[Any]
     head: States
+    mid: States
     base: States
     ring: Plots
     ring_n: IntArray
+    mid_n: IntArray
     t_s: FloatArray
     mean: FloatArray
     spread: FloatArray
     scratch: States
-    work: Work
+
+
+SCRATCH_ROWS = 4096
+"""So many predictions are kept until their plots are chosen; those of more tracks are made twice."""
 
 
 def make_filters(models: Models, n: int, k: int) -> Filters:
     """Filters with n empty rows and rings of k plots."""
     return Filters(
+        models=as_array(models),
+        work=as_array(make_work(models)),
         head=make_states(models, n),
+        mid=make_states(models, n),
         base=make_states(models, n),
         ring=empty_plots((n, k)),
         ring_n=np.zeros(n, np.int64),
+        mid_n=np.zeros(n, np.int64),
         t_s=np.zeros(n),
         mean=np.zeros((n, 4)),
         spread=np.zeros((n, 3)),
-        scratch=make_states(models, 1),
-        work=make_work(models),
+        scratch=make_states(models, min(n, SCRATCH_ROWS)),
     )
 
 
 def join_rows(first: Filters, second: Filters) -> Filters:
-    """The rows of both, with the scratch of the first."""
-    rows: dict[str, Any] = {
-        name: np.concatenate((getattr(first, name), getattr(second, name))) for name in Filters._fields[:7]
-    }
+    """The rows of both, with the models and the work of the first."""
+    names = [name for name in Filters._fields if name not in ("models", "work")]
+    rows: dict[str, Any] = {name: np.concatenate((getattr(first, name), getattr(second, name))) for name in names}
+    rows["scratch"] = rows["scratch"][:SCRATCH_ROWS]
     return first._replace(**rows)
 
 
 @kernel
-def begin(models: Models, f: Filters, rows: IntArray, plots: Plots, sigma_v_mps: float) -> None:
+def begin(f: Filters, rows: IntArray, plots: Plots, sigma_v_mps: float) -> None:
     """Start tracks in ``rows`` from single plots, see ``imm.begin``."""
     for k in range(len(rows)):
         i = rows[k]
-        imm.begin(models, f.head[i], plots[k], sigma_v_mps)
+        imm.begin(f.models[0], f.head[i], plots[k], sigma_v_mps)
         f.base[i] = f.head[i]
-        f.ring_n[i] = 0
-        _summarise(models, f, i)
+        f.ring_n[i] = f.mid_n[i] = 0
+        _summarise(f, i)
 
 
 @kernel
-def feed(models: Models, f: Filters, rows: IntArray, plots: Plots) -> BoolArray:
+def feed(f: Filters, rows: IntArray, plots: Plots) -> BoolArray:
     """Feed plot k to row ``rows[k]``, in order or late; False where the plot is older than the row's base."""
     taken = np.ones(len(rows), np.bool_)
     for k in range(len(rows)):
-        i = rows[k]
-        if plots[k].t_s < f.base[i].t_s:
-            taken[k] = False
-            continue
-        in_order = plots[k].t_s >= f.head[i].t_s
-        if f.ring_n[i] == f.ring.shape[1]:
-            # The ring is full: its oldest plot moves into the base, or the new one where that is older still.
-            oldest = plots[k] if plots[k].t_s < f.ring[i, 0].t_s else f.ring[i, 0]
-            imm.filter_plot(models, f.base[i], oldest, f.work)
-            if plots[k].t_s >= f.ring[i, 0].t_s:
-                _drop_oldest(f, i)
-                _insert(f, i, plots[k])
-        else:
-            _insert(f, i, plots[k])
-        first = f.ring_n[i] - 1 if in_order else 0
-        if not in_order:
-            f.head[i] = f.base[i]
-        for h in range(first, f.ring_n[i]):
-            imm.filter_plot(models, f.head[i], f.ring[i, h], f.work)
-        _summarise(models, f, i)
+        taken[k] = _feed_one(f, rows[k], plots[k])
     return taken
 
 
 @kernel
-def predict(models: Models, f: Filters, rows: IntArray, t_s: FloatArray, out: Mixture) -> BoolArray:
+def _feed_one(f: Filters, i: int, plot: Plot) -> bool:
+    if plot.t_s < f.base[i].t_s:
+        return False
+    in_order = plot.t_s >= f.head[i].t_s
+    place = _insert(f, i, plot)
+    if in_order:
+        imm.filter_plot(f.models[0], f.head[i], plot, f.work[0])
+    else:
+        _replay(f, i, place)
+    _after_feeding(f, i)
+    return True
+
+
+@kernel
+def _replay(f: Filters, i: int, place: int) -> None:
+    """Filter the head again, from the last stored state before the plot that was put into the ring at ``place``."""
+    from_mid = place >= f.mid_n[i] > 0
+    f.head[i] = f.mid[i] if from_mid else f.base[i]
+    for h in range(f.mid_n[i] if from_mid else 0, f.ring_n[i]):
+        imm.filter_plot(f.models[0], f.head[i], f.ring[i, h], f.work[0])
+        if h == f.mid_n[i] - 1:
+            f.mid[i] = f.head[i]
+
+
+@kernel
+def _after_feeding(f: Filters, i: int) -> None:
+    """Keep the state half way, and move the base on where the ring is full."""
+    size = f.ring.shape[1]
+    if f.ring_n[i] == size:
+        f.base[i] = f.mid[i]
+        dropped = f.mid_n[i]
+        for h in range(dropped, size):
+            f.ring[i, h - dropped] = f.ring[i, h]
+        f.ring_n[i] = size - dropped
+        f.mid_n[i] = 0
+    if f.mid_n[i] == 0 and f.ring_n[i] >= size // 2:
+        f.mid[i] = f.head[i]
+        f.mid_n[i] = f.ring_n[i]
+    _summarise(f, i)
+
+
+@kernel
+def predict(f: Filters, rows: IntArray, t_s: FloatArray, out: Mixture) -> BoolArray:
     """Prediction of rows to their times, model by model, without changing them.
 
     A time before a row's last plot is answered by filtering its ring up to that time; before its base there is no
@@ -126,33 +162,116 @@ def predict(models: Models, f: Filters, rows: IntArray, t_s: FloatArray, out: Mi
         (m,) whether there is an answer.
     """
     known = np.ones(len(rows), np.bool_)
-    state = f.scratch[0]
     for k in range(len(rows)):
-        i = rows[k]
-        if t_s[k] >= f.head[i].t_s:
-            f.scratch[0] = f.head[i]
-        elif t_s[k] >= f.base[i].t_s:
-            f.scratch[0] = f.base[i]
-            for h in range(f.ring_n[i]):
-                if f.ring[i, h].t_s > t_s[k]:
-                    break
-                imm.filter_plot(models, state, f.ring[i, h], f.work)
-        else:
-            known[k] = False
-            continue
-        imm.interact(models, state, t_s[k], f.work)
-        imm.write_mixture(models, state, state.x, state.P, out, k)
+        known[k] = _predict_one(f, rows[k], t_s[k], 0, out, k)
     return known
 
 
 @kernel
-def refined(models: Models, f: Filters, rows: IntArray, lag: int, out: Mixture) -> FloatArray:
+def estimate(f: Filters, rows: IntArray, t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Predictions as ``estimates`` gives them: means (m, 4), covariances (m, 4, 4), model probabilities (m, r).
+
+    A row that has no answer at its time is all zeros.
+    """
+    m, r = len(rows), len(f.models[0].kind)
+    mean, covariance, probability = np.zeros((m, 4)), np.zeros((m, 4, 4)), np.zeros((m, r))
+    one = Mixture(np.empty((1, r, 4)), np.empty((1, r, 4, 4)), np.empty((1, r)))
+    for k in range(m):
+        if not _predict_one(f, rows[k], t_s[k], 0, one, 0):
+            continue
+        probability[k] = one.mu[0]
+        if f.models[0].printed:
+            printed.product_of_gaussians(one.x[0], one.P[0], mean[k], covariance[k])
+        else:
+            imm.moment_match(one.x[0], one.P[0], one.mu[0], mean[k], covariance[k])
+    return mean, covariance, probability
+
+
+@kernel
+def _predict_one(f: Filters, i: int, t_s: float, place: int, out: Mixture, k: int) -> bool:
+    """Predict row ``i`` into ``scratch[place]``, and write it as mixture ``k``."""
+    if t_s >= f.head[i].t_s:
+        f.scratch[place] = f.head[i]
+    elif t_s >= f.base[i].t_s:
+        from_mid = f.mid_n[i] > 0 and t_s >= f.mid[i].t_s
+        f.scratch[place] = f.mid[i] if from_mid else f.base[i]
+        for h in range(f.mid_n[i] if from_mid else 0, f.ring_n[i]):
+            if f.ring[i, h].t_s > t_s:
+                break
+            imm.filter_plot(f.models[0], f.scratch[place], f.ring[i, h], f.work[0])
+    else:
+        return False
+    state = f.scratch[place]
+    imm.interact(f.models[0], state, t_s, f.work[0])
+    imm.write_mixture(f.models[0], state, state.x, state.P, out, k)
+    return True
+
+
+@kernel
+def associate(
+    f: Filters, rows: IntArray, first: BoolArray, plots: Plots, limit: float, strength: Strength
+) -> tuple[IntArray, FloatArray, BoolArray]:
+    """Find out which row each plot is of, one to one, and feed it to that row.
+
+    Args:
+        rows: rows to choose from. first: (all rows,) those that choose before the others.
+        plots: (m,). limit: of the gate. strength: of the targets.
+
+    Returns:
+        (m,) the row of each plot or -1, the cost of the pair (see ``gating.gate``), and whether the row could still
+        take the plot.
+    """
+    m = len(plots)
+    row, cost, fed = np.full(m, -1, np.int64), np.zeros(m), np.zeros(m, np.bool_)
+    near = gating.near(f.mean, f.spread, f.t_s, rows, plots, limit, strength)
+    times = gating.nearest_times(f.mean[near], f.t_s[near], plots)
+    r = len(f.models[0].kind)
+    n = len(near)
+    out = Mixture(np.empty((n, r, 4)), np.empty((n, r, 4, 4)), np.empty((n, r)))
+    count = 0
+    for k in range(n):
+        place = count if count < len(f.scratch) else 0
+        if _predict_one(f, near[k], times[k], place, out, count):
+            near[count], times[count] = near[k], times[k]
+            count += 1
+    near, times = near[:count], times[:count]
+    ahead = Mixture(out.x[:count], out.P[:count], out.mu[:count])
+    chosen = gating.choose(ahead, times, first[near], plots, limit, cost)
+    # Where a transition matrix is learnt from, or the past refined, an update needs more than the predicted state.
+    direct = _predicted_state_is_enough(f)
+    for j in range(m):
+        k = chosen[j]
+        if k < 0:
+            continue
+        i = near[k]
+        row[j] = i
+        same = plots[j].t_s == times[k] and times[k] >= f.head[i].t_s
+        if direct and same and k < len(f.scratch) and count <= len(f.scratch):
+            dt_s = plots[j].t_s - f.head[i].t_s
+            _insert(f, i, plots[j])
+            f.head[i] = f.scratch[k]
+            imm.update(f.models[0], f.head[i], plots[j], dt_s, f.work[0])
+            _after_feeding(f, i)
+            fed[j] = True
+        else:
+            fed[j] = _feed_one(f, i, plots[j])
+    return row, cost, fed
+
+
+@kernel
+def _predicted_state_is_enough(f: Filters) -> bool:
+    models = f.models[0]
+    return models.printed == 0 and models.lags == 0 and bool(np.isinf(models.prior_count).all())
+
+
+@kernel
+def refined(f: Filters, rows: IntArray, lag: int, out: Mixture) -> FloatArray:
     """What is now known of rows ``lag`` plots ago (1 to ``models.lags``), written to ``out``; returns times (m,)."""
     t_s = np.empty(len(rows))
     for k in range(len(rows)):
         state = f.head[rows[k]]
         t_s[k] = state.y_t_s[lag - 1]
-        imm.write_mixture(models, state, state.y[lag - 1], state.Y[lag - 1], out, k)
+        imm.write_mixture(f.models[0], state, state.y[lag - 1], state.Y[lag - 1], out, k)
     return t_s
 
 
@@ -173,30 +292,24 @@ def estimates(models: Models, m: Mixture) -> tuple[FloatArray, FloatArray]:
 
 
 @kernel
-def _insert(f: Filters, i: int, plot: Plot) -> None:
-    """Put a plot into the ring in time order; there must be room."""
-    h = f.ring_n[i]
+def _insert(f: Filters, i: int, plot: Plot) -> int:
+    """Put a plot into the ring in time order, behind those of its time; its place."""
+    h = int(f.ring_n[i])
     while h > 0 and f.ring[i, h - 1].t_s > plot.t_s:
         f.ring[i, h] = f.ring[i, h - 1]
         h -= 1
     f.ring[i, h] = plot
     f.ring_n[i] += 1
+    return h
 
 
 @kernel
-def _drop_oldest(f: Filters, i: int) -> None:
-    for h in range(1, f.ring_n[i]):
-        f.ring[i, h - 1] = f.ring[i, h]
-    f.ring_n[i] -= 1
-
-
-@kernel
-def _summarise(models: Models, f: Filters, i: int) -> None:
+def _summarise(f: Filters, i: int) -> None:
     """Mean state and greatest variances of the head, for ``near``."""
-    head, mu = f.head[i], f.work.log_likelihood
+    head, mu = f.head[i], f.work[0].log_likelihood
     f.t_s[i] = head.t_s
-    imm.probabilities(models, head, mu)
-    r = len(models.kind)
+    imm.probabilities(f.models[0], head, mu)
+    r = len(f.models[0].kind)
     for a in range(4):
         f.mean[i, a] = 0.0
         for j in range(r):
@@ -210,100 +323,3 @@ def _summarise(models: Models, f: Filters, i: int) -> None:
         cross = max(cross, abs(P[0, 2]) + abs(P[1, 3]))
         velocity = max(velocity, P[2, 2] + P[3, 3] + dve * dve + dvn * dvn)
     f.spread[i, 0], f.spread[i, 1], f.spread[i, 2] = position, cross, velocity
-
-
-def strength(models: Models) -> Strength:
-    """What the target of these models can do, two sigma of each model's own parameters."""
-    turns = models.kind == TURN
-    own = np.abs(models.numbers[:, 1]) + 2.0 * models.numbers[:, 2]
-    return Strength(
-        float(models.numbers[:, 0].max()), float(max(own[~turns], default=0.0)), float(max(own[turns], default=0.0))
-    )
-
-
-class ImmTracks:
-    """The filters of a layer of tracks: interacting multiple models with rings."""
-
-    def __init__(self, models: Models, rows: int, ring: int, sigma_v_mps: float) -> None:
-        self.models = models
-        self.filters = make_filters(models, rows, ring)
-        self._ring = ring
-        self._sigma_v_mps = sigma_v_mps
-        self._strength = strength(models)
-
-    @property
-    def t_s(self) -> FloatArray:
-        """(n,) times of the last plots."""
-        return self.filters.t_s
-
-    @property
-    def oldest_s(self) -> FloatArray:
-        """(n,) times back to which a row can answer and take late plots."""
-        return np.asarray(self.filters.base["t_s"])
-
-    @property
-    def mean(self) -> FloatArray:
-        """(n, 4) states at the last plots."""
-        return self.filters.mean
-
-    @property
-    def repairs(self) -> int:
-        """How often a covariance that was none had to be replaced."""
-        return int(self.filters.work.repairs)
-
-    def begin(self, rows: IntArray, plots: Plots) -> None:
-        """Start tracks in rows, from one plot each."""
-        begin(self.models, self.filters, rows, plots, self._sigma_v_mps)
-
-    def feed(self, rows: IntArray, plots: Plots) -> BoolArray:
-        """Feed plot k to row k; False where it comes too late."""
-        return feed(self.models, self.filters, rows, plots)
-
-    def feed_from(self, source: int, target: int) -> None:
-        """Feed the plots that row ``source`` remembers to row ``target``."""
-        plots = self.remembered(source)
-        feed(self.models, self.filters, np.full(len(plots), target), plots)
-
-    def remembered(self, row: int) -> Plots:
-        """The last plots of a row, in order of time."""
-        return self.filters.ring[row, : self.filters.ring_n[row]].copy()
-
-    def move_plots(self, sensor: int, move: Callable[[FloatArray], FloatArray]) -> None:
-        """Move the remembered plots of a sensor, positions (m, 2) to (m, 2), and filter them again from the base."""
-        f = self.filters
-        there = np.arange(f.ring.shape[1]) < f.ring_n[:, None]
-        ours = there & (f.ring["sensor"] == sensor)
-        if not ours.any():
-            return
-        f.ring["z"][ours] = move(f.ring["z"][ours])
-        rows = np.flatnonzero(ours.any(axis=1))
-        row, place = np.nonzero(there[rows])
-        plots = f.ring[rows[row], place]
-        f.head[rows] = f.base[rows]
-        f.ring_n[rows] = 0
-        feed(self.models, f, rows[row], plots)
-
-    def near(self, rows: IntArray, plots: Plots, limit: float) -> IntArray:
-        """The rows that may have a plot in their gate."""
-        f = self.filters
-        return near(f.mean, f.spread, f.t_s, rows, plots, limit, self._strength)
-
-    def predict(self, rows: IntArray, t_s: FloatArray) -> tuple[Mixture, BoolArray]:
-        """Predictions of rows to their times, and which of them are known."""
-        out = make_mixture(len(rows), len(self.models.kind))
-        known = predict(self.models, self.filters, rows, t_s, out)
-        return out, known
-
-    def estimates(self, mixture: Mixture) -> tuple[FloatArray, FloatArray]:
-        """One mean (m, 4) and covariance (m, 4, 4) of each mixture."""
-        return estimates(self.models, mixture)
-
-    def refined(self, rows: IntArray, lag: int) -> tuple[Mixture, FloatArray]:
-        """What is now known of rows ``lag`` plots ago, and when that was."""
-        out = make_mixture(len(rows), len(self.models.kind))
-        t_s = refined(self.models, self.filters, rows, lag, out)
-        return out, t_s
-
-    def grow(self, rows: int) -> None:
-        """Add empty rows."""
-        self.filters = join_rows(self.filters, make_filters(self.models, rows, self._ring))

@@ -53,16 +53,18 @@ def uniformised(G: FloatArray, size: int) -> tuple[FloatArray, float]:
     """The chain of generator G as jumps of one rate: U = I + G / rate with rate = max -G_ii (Jensen 1953).
 
     Returns:
-        U (size, size), whose rows are probabilities; states beyond those of G are never left. The rate, 1/s.
+        U, U^2, U^3 (3, size, size), whose rows are probabilities; states beyond those of G are never left. The rate,
+        1/s.
     """
     rate = max(float(-np.diag(G).min()), 1e-300)
     U = np.eye(size)
     U[: len(G), : len(G)] += G / rate
-    return np.maximum(U, 0.0), rate
+    U = np.maximum(U, 0.0)
+    return np.stack([U, U @ U, U @ U @ U]), rate
 
 
 @kernel
-def transition_matrix(U: FloatArray, rate: float, dt_s: float, out: FloatArray, powers: FloatArray) -> None:
+def transition_matrix(jumps: FloatArray, rate: float, dt_s: float, out: FloatArray, work: FloatArray) -> None:
     """Write Pi(dt) = expm(G dt) of a uniformised chain into ``out`` (r, r); rows sum to one, nothing is negative.
 
     With p = rate dt / 2^m <= 1/16, expm(G dt / 2^m) ~ sum_k p^k/k! U^k up to k = 8, the sum being grouped by powers of
@@ -70,16 +72,14 @@ def transition_matrix(U: FloatArray, rate: float, dt_s: float, out: FloatArray, 
     It needs no eigenvectors, which a chain may lack.
 
     Args:
-        U: (r, r). rate: 1/s. dt_s: >= 0.
-        powers: (3, r, r) scratch.
+        jumps: (3, r, r) U, U^2, U^3. rate: 1/s. dt_s: >= 0.
+        work: (r, r) scratch.
     """
+    U, U2, U3 = jumps[0], jumps[1], jumps[2]
     r = len(U)
     p, halvings = min(rate * dt_s, _MIXED), 0
     while p > _LARGEST_STEP:
         p, halvings = 0.5 * p, halvings + 1
-    U2, U3, work = powers[0], powers[1], powers[2]
-    _multiply(U, U, U2)
-    _multiply(U2, U, U3)
     c2 = p * p / 2.0
     c3 = c2 * p / 3.0
     c4 = c3 * p / 4.0

@@ -74,6 +74,32 @@ class _Pairs(NamedTuple):
     declared: npt.NDArray[np.bool_]
 
 
+class Candidates(NamedTuple):
+    """Pairs to look at, sorted by key: indices into both sets of tracks, and which are close in position."""
+
+    key: IntArray
+    a: IntArray
+    b: IntArray
+    near: BoolArray
+
+
+def candidates(a: LocalTracks, b: LocalTracks, stored: IntArray) -> Candidates:
+    """Pairs close in position, and pairs whose keys are ``stored`` and whose tracks both live."""
+    near = np.empty(0, np.int64)
+    if len(a.number) and len(b.number):
+        R = b.P[:, :2, :2] + b.blur
+        plots = make_plots(b.corrected()[:, :2], np.stack([R[:, 0, 0], R[:, 0, 1], R[:, 1, 1]], axis=1), 0.0)
+        P = a.P.copy()
+        P[:, :2, :2] += a.blur
+        tracks = Mixture(np.ascontiguousarray(a.corrected()[:, None]), P[:, None], np.ones((len(P), 1)))
+        i, j, _ = gating.gate(tracks, np.zeros(len(P)), plots, _CANDIDATE_GATE)
+        near = (a.number[i] << 31) | b.number[j]
+    key = np.union1d(near, stored)
+    ia, ib = index_of(a.number, key >> 31), index_of(b.number, key & NUMBER_MASK)
+    alive = (ia >= 0) & (ib >= 0)
+    return Candidates(key[alive], ia[alive], ib[alive], np.isin(key[alive], near))
+
+
 class SequentialTest:
     """SeqLLR between two sensors. State: one sum a pair; pairs die with their tracks."""
 
@@ -89,7 +115,7 @@ class SequentialTest:
             t_s: now.
             blur: gives, for pairs of raw states, the covariance (n, 2, 2) of the difference of the sensors' shifts.
         """
-        key, ia, ib, near = self._candidates(a, b)
+        key, ia, ib, near = candidates(a, b, self._pairs.key)
         old, known = self._recall(key)
         unknown = blur(a.x[ia], b.x[ib]) if blur else np.zeros((len(ia), 2, 2))
         distance, logdet = state_distances(a.corrected(), a.P, b.corrected(), b.P, ia, ib, unknown)
@@ -105,22 +131,6 @@ class SequentialTest:
         keep = near | (pairs.ratio > 0.0)
         self._pairs = _Pairs(**{name: v[keep] for name, v in pairs._replace(declared=declared)._asdict().items()})
         return DeclaredPairs(ia[declared], ib[declared], pairs.ratio[declared])
-
-    def _candidates(self, a: LocalTracks, b: LocalTracks) -> tuple[IntArray, IntArray, IntArray, BoolArray]:
-        """Pairs close in position, and pairs under test whose tracks both live; which of them are close."""
-        near = np.empty(0, np.int64)
-        if len(a.number) and len(b.number):
-            R = b.P[:, :2, :2] + b.blur
-            plots = make_plots(b.corrected()[:, :2], np.stack([R[:, 0, 0], R[:, 0, 1], R[:, 1, 1]], axis=1), 0.0)
-            P = a.P.copy()
-            P[:, :2, :2] += a.blur
-            tracks = Mixture(np.ascontiguousarray(a.corrected()[:, None]), P[:, None], np.ones((len(P), 1)))
-            i, j, _ = gating.gate(tracks, np.zeros(len(P)), plots, _CANDIDATE_GATE)
-            near = (a.number[i] << 31) | b.number[j]
-        key = np.union1d(near, self._pairs.key)
-        ia, ib = index_of(a.number, key >> 31), index_of(b.number, key & NUMBER_MASK)
-        alive = (ia >= 0) & (ib >= 0)
-        return key[alive], ia[alive], ib[alive], np.isin(key[alive], near)
 
     def _recall(self, key: IntArray) -> tuple[_Pairs, npt.NDArray[np.bool_]]:
         """The stored sums of these keys (zeros for new pairs), and which were stored."""

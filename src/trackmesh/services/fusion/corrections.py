@@ -35,10 +35,17 @@ class Corrections:
         """Plots of one or more sensors, each corrected by what is applied to its sensor."""
         if self.biases is None or not any(self.biases.locked(sensor_id) for sensor_id in self._ids):
             return plots
-        out = plots.copy()
+        out = plots
         for index in np.unique(plots["sensor"]).tolist():
-            of_it = plots["sensor"] == index
-            out["z"][of_it] -= self.biases.shift(self._ids[index], plots["z"][of_it])
+            out = self.correct_of(index, out, out["sensor"] == index)
+        return out
+
+    def correct_of(self, index: int, plots: Plots, which: npt.NDArray[np.bool_] | slice = slice(None)) -> Plots:
+        """As ``correct``, where it is known which plots are of sensor ``index``; by default all."""
+        if self.biases is None or not self.biases.locked(self._ids[index]):
+            return plots
+        out = plots.copy()
+        out["z"][which] -= self.biases.shift(self._ids[index], plots["z"][which])
         return out
 
     def message(self, unit_id: str, boot_id: str, seq: int, t_ns: int) -> Registration:

@@ -230,7 +230,9 @@ class FusionEngine:
         sensor.local_clutter.add(n - int(got.by_confirmed.sum()), share)
         density = sensor.system_clutter.value(n, share)
         fed = self._system.step(
-            self.corrections.correct(plots), self._look(sensor, sensor.index, plots, sectors, density), self._now_s
+            self.corrections.correct_of(sensor.index, plots),
+            self._look(sensor, sensor.index, plots, sectors, density),
+            self._now_s,
         )
         sensor.system_clutter.add(n - int(fed.by_confirmed.sum()), share)
         self.log_likelihood += fed.log_likelihood

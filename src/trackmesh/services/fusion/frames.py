@@ -8,22 +8,29 @@ import pymap3d
 
 from trackmesh.protocol.errors import RefusedMessage
 from trackmesh.protocol.messages import COASTING, CONFIRMED, TENTATIVE, Geodetic, TrackFrame, TrackQuery
+from trackmesh.services.estimation.jit import kernel
 from trackmesh.services.fusion.layer import Layer
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-_UPPER = np.triu_indices(6)
+_PLACE = np.zeros((6, 6), np.int64)
+_PLACE[np.triu_indices(6)] = np.arange(21)
 _FLOAT32_MOST = float(np.finfo(np.float32).max)
 
 
+@kernel
 def pack_states(x: FloatArray, P: FloatArray) -> tuple[FloatArray, npt.NDArray[np.float32]]:
     """States (n, 4) and covariances (n, 4, 4) as (n, 6) and upper triangles (n, 21), padded with zeros."""
     n, d = x.shape
-    state, full = np.zeros((n, 6)), np.zeros((n, 6, 6))
-    state[:, :d], full[:, :d, :d] = x, P
-    # A prediction over a year is worth nothing, but must still be a message: it saturates.
-    return state, np.clip(full[:, _UPPER[0], _UPPER[1]], -_FLOAT32_MOST, _FLOAT32_MOST).astype("<f4")
+    state, covariance = np.zeros((n, 6)), np.zeros((n, 21), np.float32)
+    for k in range(n):
+        for a in range(d):
+            state[k, a] = x[k, a]
+            for b in range(a, d):
+                # A prediction over a year is worth nothing, but must still be a message: it saturates.
+                covariance[k, _PLACE[a, b]] = min(max(P[k, a, b], -_FLOAT32_MOST), _FLOAT32_MOST)
+    return state, covariance
 
 
 def status_of(layer: Layer, rows: IntArray, t_s: float, coasting_after_s: float) -> npt.NDArray[np.uint8]:

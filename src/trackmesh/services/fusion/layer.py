@@ -11,7 +11,6 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from trackmesh.services.estimation import assignment, gating
 from trackmesh.services.estimation.gating import Mixture
 from trackmesh.services.estimation.plots import Plots
 from trackmesh.services.fusion import life as lives
@@ -21,10 +20,6 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 Move = Callable[[FloatArray], FloatArray]
-
-_SCORE_AT_ZERO = 60.0
-_CONFIRMED_FIRST = 200.0
-_LEAST_SCORE = 0.01
 
 
 class TrackFilters(Protocol):
@@ -42,8 +37,12 @@ class TrackFilters(Protocol):
     def begin(self, rows: IntArray, plots: Plots) -> None: ...  # noqa: D102
     def feed(self, rows: IntArray, plots: Plots) -> BoolArray: ...  # noqa: D102
     def feed_from(self, source: int, target: int) -> None: ...  # noqa: D102
-    def near(self, rows: IntArray, plots: Plots, limit: float) -> IntArray: ...  # noqa: D102
-    def predict(self, rows: IntArray, t_s: FloatArray) -> tuple[Mixture, BoolArray]: ...  # noqa: D102
+    def associate(  # noqa: D102
+        self, rows: IntArray, first: BoolArray, plots: Plots, limit: float
+    ) -> tuple[IntArray, FloatArray, BoolArray]: ...
+    def estimate(  # noqa: D102
+        self, rows: IntArray, t_s: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]: ...
     def estimates(self, mixture: Mixture) -> tuple[FloatArray, FloatArray]: ...  # noqa: D102
     def refined(self, rows: IntArray, lag: int) -> tuple[Mixture, FloatArray]: ...  # noqa: D102
     def remembered(self, row: int) -> Plots: ...  # noqa: D102
@@ -122,12 +121,11 @@ class Layer:
         ``now_s`` is the time at which tracks are judged; with late plots it is after ``look.t_s``.
         """
         alive = self.rows
-        row = np.full(len(plots), -1, np.int64)
-        by_confirmed = np.zeros(len(row), np.bool_)
+        row, by_confirmed = np.full(len(plots), -1, np.int64), np.zeros(len(plots), np.bool_)
         late, gained = 0, 0.0
-        if len(row):
+        if len(plots):
             if len(alive):
-                late, gained = self._associate(alive, plots, look, row, by_confirmed)
+                row, by_confirmed, late, gained = self._associate(alive, plots, look)
             self._start(plots, look, row)
         lost = self._miss(alive, look)
         confirmed, ended = self.judge(now_s)
@@ -135,9 +133,8 @@ class Layer:
 
     def predict(self, rows: IntArray, t_s: float | FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Moment-matched states (m, 4), covariances (m, 4, 4) and model probabilities (m, r) of rows at their times."""
-        times = np.ascontiguousarray(np.broadcast_to(np.asarray(t_s, float), len(rows)))
-        mixture, _ = self.filters.predict(rows, times)
-        return *self.filters.estimates(mixture), mixture.mu
+        times = t_s if isinstance(t_s, np.ndarray) else np.full(len(rows), t_s)
+        return self.filters.estimate(rows, times)
 
     def refined(self, rows: IntArray, lag: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """States (m, 4) and covariances (m, 4, 4) of rows ``lag`` plots ago, and their times (m,)."""
@@ -149,6 +146,8 @@ class Layer:
         rows = self.rows
         confirmed, ended = np.empty(len(rows), np.int64), np.empty(len(rows), np.int64)
         n_confirmed, n_ended = lives.judge(self.life, self.rules, rows, t_s, confirmed, ended)
+        if not (n_confirmed or n_ended):
+            return confirmed[:0], []
         gone = ended[:n_ended].tolist()
         told = [(i, int(self.life.uid[i]), int(self.life.link[i])) for i in gone if self.life.confirmed[i]]
         self._free += gone
@@ -167,9 +166,10 @@ class Layer:
         for row, one, gain in zip(rows.tolist(), plots, score.tolist(), strict=True):
             rest = one[1:]
             self.filters.feed(np.full(len(rest), row), rest)
-            for plot in one:
-                seen = np.array([plot.t_s])
-                lives.hit(self.life, self.rules, np.array([row]), seen, np.zeros(1), int(plot.sensor))
+            for k in range(len(one)):
+                plot = one[k : k + 1]
+                yes, nothing = np.ones(1, np.bool_), np.zeros(1)
+                lives.hit(self.life, self.rules, np.array([row]), yes, plot, nothing, int(plot["sensor"][0]))
             self.life.score[row] = self.life.best[row] = gain
         self.life.confirmed[rows] = True
         return rows
@@ -188,45 +188,17 @@ class Layer:
                 getattr(more, name)[:, :have] = getattr(self.life, name)
             self.life = self.life._replace(seen_s=more.seen_s, looked_s=more.looked_s, member=more.member)
 
-    def _associate(
-        self, alive: IntArray, plots: Plots, look: Look, row: IntArray, by_confirmed: BoolArray
-    ) -> tuple[int, float]:
-        near = self.filters.near(alive, plots, self.gate)
-        if not len(near):
-            return 0, 0.0
-        times = self._times(near, plots)
-        mixture, known = self.filters.predict(near, times)
-        if not known.all():
-            near, times, mixture = near[known], times[known], Mixture(*(part[known] for part in mixture))
-        i, j, cost = gating.gate(mixture, times, plots, self.gate)
-        if not len(i):
-            return 0, 0.0
-        confirmed = self.life.confirmed[near]
-        score = np.maximum(_SCORE_AT_ZERO - cost, _LEAST_SCORE) + _CONFIRMED_FIRST * confirmed[i]
-        chosen = assignment.assign(i, j, score, len(near), len(row))
-        taken = np.flatnonzero(chosen >= 0)
-        rows = near[chosen[taken]]
-        fed = self.filters.feed(rows, plots[taken])
-        gain = self._gain(i, j, cost, chosen, look)
-        t_s = np.ascontiguousarray(plots["t_s"][taken])
-        lives.hit(self.life, self.rules, rows[fed], t_s[fed], gain[fed], look.sensor)
-        row[taken] = rows
-        by_confirmed[taken] = confirmed[chosen[taken]]
+    def _associate(self, alive: IntArray, plots: Plots, look: Look) -> tuple[IntArray, BoolArray, int, float]:
+        """Plots to tracks: row of each plot or -1, whether it was confirmed, how many came too late, what was gained.
+
+        A plot is worth ln(Pd / (2 pi lambda)) - cost / 2 to its track.
+        """
+        row, cost, fed = self.filters.associate(alive, self.life.confirmed, plots, self.gate)
+        by_confirmed = (row >= 0) & self.life.confirmed[row]
+        gain = np.log(look.p_detect / (2.0 * np.pi * look.clutter_density)) - 0.5 * cost
+        lives.hit(self.life, self.rules, row, fed, plots, gain, look.sensor)
         gained = gain[fed].sum() + fed.sum() * np.log(look.clutter_density / look.reference_density)
-        return int(len(fed) - fed.sum()), float(gained)
-
-    def _times(self, rows: IntArray, plots: Plots) -> FloatArray:
-        """When the sensor looked at each row: the time of the plot nearest to it in the plane."""
-        t = plots["t_s"]
-        if (t == t[0]).all():
-            return np.full(len(rows), t[0])
-        return gating.nearest_times(self.filters.mean[rows], self.filters.t_s[rows], plots)
-
-    def _gain(self, i: IntArray, j: IntArray, cost: FloatArray, chosen: IntArray, look: Look) -> FloatArray:
-        """Log-likelihood ratio of each chosen pair, in order of plots: ln(Pd / (2 pi lambda)) - cost / 2."""
-        pair = np.flatnonzero(chosen[j] == i)
-        order = pair[np.argsort(j[pair])]
-        return np.asarray(np.log(look.p_detect / (2.0 * np.pi * look.clutter_density)) - 0.5 * cost[order])
+        return row, by_confirmed, int((row >= 0).sum() - fed.sum()), float(gained)
 
     def _start(self, plots: Plots, look: Look, row: IntArray) -> None:
         unused = np.flatnonzero(row < 0)

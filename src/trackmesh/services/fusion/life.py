@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from trackmesh.services.estimation.jit import kernel
+from trackmesh.services.estimation.plots import Plots
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -114,16 +115,18 @@ def born(life: Life, rows: IntArray, uid: int, t_s: FloatArray, sensor: int) -> 
 
 
 @kernel
-def hit(life: Life, rules: Rules, rows: IntArray, t_s: FloatArray, gain: FloatArray, sensor: int) -> None:
-    """Each row took a plot of ``sensor`` at ``t_s``; ``gain`` is added to its score."""
+def hit(life: Life, rules: Rules, rows: IntArray, fed: BoolArray, plots: Plots, gain: FloatArray, sensor: int) -> None:
+    """Row k took plot k of ``sensor`` where it was ``fed``; ``gain`` is added to its score."""
     for k in range(len(rows)):
-        i = rows[k]
+        if not fed[k]:
+            continue
+        i, t_s = rows[k], plots[k].t_s
         life.hits[i] += 1
         life.misses[i] = 0
-        life.last_s[i] = max(life.last_s[i], t_s[k])
-        life.first_s[i] = min(life.first_s[i], t_s[k])
-        life.seen_s[i, sensor] = max(life.seen_s[i, sensor], t_s[k])
-        life.looked_s[i, sensor] = max(life.looked_s[i, sensor], t_s[k])
+        life.last_s[i] = max(life.last_s[i], t_s)
+        life.first_s[i] = min(life.first_s[i], t_s)
+        life.seen_s[i, sensor] = max(life.seen_s[i, sensor], t_s)
+        life.looked_s[i, sensor] = max(life.looked_s[i, sensor], t_s)
         life.score[i] = min(life.score[i] + gain[k], rules.score_cap)
         life.best[i] = max(life.best[i], life.score[i])
 

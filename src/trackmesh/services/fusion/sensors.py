@@ -111,8 +111,9 @@ class Sensor:
                 raise RefusedMessage(
                     "no_variance", f"Sensor {self.info.sensor_id} gives neither variances nor sigma of {name}."
                 )
-        sigma = np.array([self.info.sigma[name] for name in names])
-        return np.broadcast_to(sigma * sigma, (len(batch.values), 2))
+        out = np.empty((len(batch.values), 2))
+        out[:, 0], out[:, 1] = (self.info.sigma[name] ** 2 for name in names)
+        return out
 
     def _polar(self, batch: PlotBatch, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
         if self.info.site is None and self.info.site_enu_m is None:

@@ -13,7 +13,7 @@ from trackmesh.protocol.messages.base import NonNegative, Positive
 from trackmesh.services.estimation.alpha_beta_tracks import AlphaBetaTracks
 from trackmesh.services.estimation.bank import Branch, make_models
 from trackmesh.services.estimation.filters import FilterName, generic_models, manoeuvre_models, velocity_models
-from trackmesh.services.estimation.tracks import ImmTracks
+from trackmesh.services.estimation.imm_tracks import ImmTracks
 from trackmesh.services.fusion.biases import RegistrationRules
 from trackmesh.services.fusion.layer import TrackFilters
 from trackmesh.services.runtime import ServiceSettings
@@ -56,8 +56,10 @@ class EngineSettings(BaseModel):
     max_misses: Annotated[int, Field(ge=1)] = 3
     coast_s: Positive = Field(15.0, description="a confirmed track ends after this time without a plot")
     local_coast_periods: Positive = 4.0
-    ring_system: Annotated[int, Field(ge=2, le=512)] = Field(24, description="plots a system track can replay")
-    ring_local: Annotated[int, Field(ge=2, le=512)] = 12
+    ring_system: Annotated[int, Field(ge=2, le=512)] = Field(
+        32, description="plots a system track keeps, of which the younger half can always be replayed"
+    )
+    ring_local: Annotated[int, Field(ge=2, le=512)] = 16
     max_lateness_s: Positive = Field(10.0, description="plots older than this are dropped and counted")
     cycle_s: Positive = Field(2.0, description="association cycle")
     pair_speed_mps: Positive = Field(250.0, description="spread of velocities expected of unrelated tracks, per axis")
