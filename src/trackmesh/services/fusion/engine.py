@@ -8,14 +8,12 @@ comes with the data, and as ticks when no data comes.
 from __future__ import annotations
 
 from collections import Counter
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from trackmesh.protocol.errors import RefusedMessage
 from trackmesh.protocol.messages import (
-    ENDED,
     Geodetic,
     PlotBatch,
     RefinedFrame,
@@ -32,34 +30,20 @@ from trackmesh.services.fusion.corrections import Corrections
 from trackmesh.services.fusion.cycle import AssociationCycle
 from trackmesh.services.fusion.layer import Layer, Look
 from trackmesh.services.fusion.life import Rules
+from trackmesh.services.fusion.picture import Picture, Unit
 from trackmesh.services.fusion.restart import picture_of
 from trackmesh.services.fusion.sensors import Sensor
 from trackmesh.services.fusion.settings import EngineSettings
+from trackmesh.services.fusion.timeline import Timeline
+
+__all__ = ["FusionEngine", "Unit"]
 
 IntArray = npt.NDArray[np.int64]
 
-_COASTING_AFTER_PERIODS = 1.5
 _TENTATIVE_AGE_PERIODS = 2.2
 _SEEN_LATELY_PERIODS = 5.0
 _JUDGED_SECTORS_LATE = 1.5
-_TRACK_BITS = 41
 _ROWS = 64
-
-TRACK_EPOCH_MS = 1_577_836_800_000
-"""2020-01-01 in Unix milliseconds: track numbers begin at the milliseconds since then, so no restart repeats one."""
-
-
-class Unit(NamedTuple):
-    """Who the engine is: its names in frames and the numbers it gives to tracks.
-
-    Track ids are ``number << 41 | n`` with n counting up from ``first_track``, so that they are unique over units and
-    restarts; 0 stands for the milliseconds from 2020 to the first data.
-    """
-
-    unit_id: str = "main"
-    number: int = 0
-    boot_id: str = "offline"
-    first_track: int = 0
 
 
 class FusionEngine:
@@ -76,12 +60,10 @@ class FusionEngine:
     def __init__(self, settings: EngineSettings, unit: Unit, origin: Geodetic | None = None) -> None:
         self.settings = settings
         self.unit = unit
-        self.origin = origin
         self.counters: Counter[str] = Counter()
         self.sensors: dict[str, Sensor] = {}
         self.log_likelihood = 0.0
-        self._models = settings.model_names()
-        self._manoeuvre_models = settings.manoeuvre_models()
+        self._time = Timeline()
         self._system = Layer(settings.system_tracks(_ROWS), self._rules(1.0, settings.coast_s), 1, settings.gate)
         self._locals: list[Layer] = []
         self.corrections = Corrections(settings.registration_rules() if settings.registration else None)
@@ -90,19 +72,20 @@ class FusionEngine:
         self._cycle = AssociationCycle(
             self._system, self._locals, self.corrections.biases, pair_rules, self.counters, self._end
         )
-        self._next_track = unit.first_track
-        self._seq = 0
-        self._epoch_ns: int | None = None
-        self._now_s = 0.0
+        self._picture = Picture(settings, unit, self._system, self.sensors, self._time)
+        self._picture.origin = origin
         self._cycle_s = -np.inf
         self._frame_s = -np.inf
-        self._ended: list[TrackFrame] = []
-        self._refined_s = np.empty(0)
+
+    @property
+    def origin(self) -> Geodetic | None:
+        """Origin of the system plane: the one given, else the site of the first sensor that has one."""
+        return self._picture.origin
 
     @property
     def now_ns(self) -> int | None:
         """The engine's time: the newest that data or ticks have told; None before any."""
-        return None if self._epoch_ns is None else self._to_ns(self._now_s)
+        return self._time.now_ns
 
     def sensor(self, info: SensorInfo) -> None:
         """Take note of a sensor; a known one is replaced, its tracks live on."""
@@ -110,7 +93,7 @@ class FusionEngine:
         if old is not None and old.info == info:
             return
         if self.origin is None and info.site is not None:
-            self.origin = info.site
+            self._picture.origin = info.site
             for known in self.sensors.values():
                 known.settle(self.origin)
         sensor = Sensor(old.index if old else len(self.sensors), info, self.origin)
@@ -135,17 +118,17 @@ class FusionEngine:
         if sensor is None:
             raise RefusedMessage("unknown_sensor", f"Nothing is known of sensor {batch.sensor_id} yet.")
         if len(batch.t_ns):
-            self._take(sensor, batch, sensor.plots(batch, self._to_s_array(batch.t_ns)))
+            self._take(sensor, batch, sensor.plots(batch, self._time.to_s_array(batch.t_ns)))
         return self._due_frame(self.settings.frame_period_s)
 
     def tick(self, t_ns: int) -> TrackFrame | None:
         """Let time advance without data; a picture now and then."""
-        self._advance(self._to_s(t_ns))
-        confirmed, ended = self._system.judge(self._now_s)
+        self._time.advance(self._time.to_s(t_ns))
+        confirmed, ended = self._system.judge(self._time.now_s)
         self._name(confirmed)
         self._note_ended(ended)
         for local in self._locals:
-            local.judge(self._now_s)
+            local.judge(self._time.now_s)
         self._cycle_if_due()
         return self._due_frame(max(self.settings.idle_frame_s, self.settings.frame_period_s))
 
@@ -156,49 +139,26 @@ class FusionEngine:
             RefusedMessage: the query cannot be answered (no origin for a geographic box).
         """
         tentative = query.status is not None and 0 in query.status
-        t_s = self._now_s
-        if query.at_t_ns is not None and self._epoch_ns is not None:
-            t_s = (query.at_t_ns - self._epoch_ns) / 1e9
-        return frames.select(self._picture(t_s, tentative), query)
+        t_s = self._time.now_s
+        if query.at_t_ns is not None and self._time.epoch_ns is not None:
+            t_s = self._time.to_s(query.at_t_ns)
+        return frames.select(self._picture.at(t_s, tentative), query)
 
     def refined(self) -> RefinedFrame | None:
         """States of ``settings.lag`` plots ago, refined by those since, of the tracks that moved on since then.
 
         None where there are none, or no lag is kept.
         """
-        if not self.settings.lag or self._epoch_ns is None:
-            return None
-        rows = self._system.rows
-        rows = rows[self._system.life.confirmed[rows]]
-        x, P, t_s = self._system.refined(rows, self.settings.lag)
-        told = np.full(len(self._system.life.uid), -np.inf)
-        told[: len(self._refined_s)] = self._refined_s
-        fresh = (t_s != told[rows]) & (self._system.life.hits[rows] > self.settings.lag)
-        if not fresh.any():
-            return None
-        rows = rows[fresh]
-        told[rows] = t_s[fresh]
-        self._refined_s = told
-        state, covariance = frames.pack_states(x[fresh], P[fresh])
-        return RefinedFrame.model_construct(
-            schema_version=1,
-            unit_id=self.unit.unit_id,
-            boot_id=self.unit.boot_id,
-            seq=self._seq,
-            t_ns=self._to_ns(self._now_s),
-            lag=self.settings.lag,
-            track_id=self._system.life.link[rows].copy(),
-            state_t_ns=self._to_ns_array(t_s[fresh]),
-            state=state,
-            covariance=covariance,
-        )
+        return self._picture.refined()
 
     def registration(self) -> Registration | None:
         """What is known of the sensors' biases, once after every association cycle."""
         if not self._registration_due:
             return None
         self._registration_due = False
-        return self.corrections.message(self.unit.unit_id, self.unit.boot_id, self._seq, self._to_ns(self._now_s))
+        return self.corrections.message(
+            self.unit.unit_id, self.unit.boot_id, self._picture.seq, self._time.to_ns(self._time.now_s)
+        )
 
     def figures(self) -> dict[str, float]:
         """Present values for the status: tracks, local tracks, pairs under the sequential test."""
@@ -215,8 +175,8 @@ class FusionEngine:
     # --- one batch ---
 
     def _take(self, sensor: Sensor, batch: PlotBatch, plots: Plots) -> None:
-        self._advance(float(plots["t_s"].max()))
-        fresh = plots["t_s"] >= self._now_s - self.settings.max_lateness_s
+        self._time.advance(float(plots["t_s"].max()))
+        fresh = plots["t_s"] >= self._time.now_s - self.settings.max_lateness_s
         self.counters["plots"] += len(plots)
         self.counters["too_late_plots"] += int(len(plots) - fresh.sum())
         if not fresh.any():
@@ -226,13 +186,13 @@ class FusionEngine:
         n, share = len(plots), 1.0 / sectors
         local = self._locals[sensor.index]
         density = sensor.local_clutter.value(n, share)
-        got = local.step(plots, self._look(sensor, 0, plots, sectors, density), self._now_s)
+        got = local.step(plots, self._look(sensor, 0, plots, sectors, density), self._time.now_s)
         sensor.local_clutter.add(n - int(got.by_confirmed.sum()), share)
         density = sensor.system_clutter.value(n, share)
         fed = self._system.step(
             self.corrections.correct_of(sensor.index, plots),
             self._look(sensor, sensor.index, plots, sectors, density),
-            self._now_s,
+            self._time.now_s,
         )
         sensor.system_clutter.add(n - int(fed.by_confirmed.sum()), share)
         self.log_likelihood += fed.log_likelihood
@@ -261,19 +221,21 @@ class FusionEngine:
 
     def _name(self, rows: IntArray) -> None:
         """Give newly confirmed system tracks their public numbers."""
-        count = len(rows)
-        self._system.life.link[rows] = (self.unit.number << _TRACK_BITS) | (self._next_track + np.arange(count))
-        self._next_track += count
-        self.counters["confirmed"] += count
+        self._picture.name(rows)
+        self.counters["confirmed"] += len(rows)
+
+    def _note_ended(self, ended: list[tuple[int, int, int]]) -> None:
+        self._picture.note_ended(np.array([row for row, _, _ in ended], np.int64))
+        self.counters["ended"] += len(ended)
 
     # --- the association cycle ---
 
     def _cycle_if_due(self) -> None:
-        if self._now_s - self._cycle_s < self.settings.cycle_s:
+        if self._time.now_s - self._cycle_s < self.settings.cycle_s:
             return
-        self._cycle_s = self._now_s
+        self._cycle_s = self._time.now_s
         self._registration_due = self.settings.registration
-        for change in self._cycle.run(list(self.sensors), self._now_s):
+        for change in self._cycle.run(list(self.sensors), self._time.now_s):
             self._correct(change)
 
     def _correct(self, change: Change) -> None:
@@ -303,92 +265,11 @@ class FusionEngine:
             self._note_ended([(row, int(known.uid[row]), int(known.link[row]))])
         self._system.drop(row)
 
-    # --- the picture ---
-
     def _due_frame(self, period_s: float) -> TrackFrame | None:
-        if self._epoch_ns is None or self._now_s - self._frame_s < period_s:
+        if self._time.epoch_ns is None or self._time.now_s - self._frame_s < period_s:
             return None
-        self._frame_s = self._now_s
-        frame = self._picture(self._now_s, self.settings.publish_tentative, self._seq, self._take_ended())
-        self._seq += 1
-        return frame
-
-    def _picture(
-        self, t_s: float, tentative: bool, seq: int | None = None, ended: list[TrackFrame] | None = None
-    ) -> TrackFrame:
-        rows = self._system.rows
-        if not tentative:
-            rows = rows[self._system.life.confirmed[rows]]
-        rows = rows[self._system.filters.oldest_s[rows] <= t_s]
-        frame = self._frame_of(rows, t_s, self._seq if seq is None else seq)
-        return frames.join(frame, ended) if ended else frame
-
-    def _frame_of(self, rows: IntArray, t_s: float, seq: int) -> TrackFrame:
-        known = self._system.life
-        x, P, mu = self._system.predict(rows, t_s)
-        state, covariance = frames.pack_states(x, P)
-        longest = max((s.info.period_s for s in self.sensors.values()), default=1.0)
-        return TrackFrame.model_construct(
-            schema_version=1,
-            unit_id=self.unit.unit_id,
-            boot_id=self.unit.boot_id,
-            seq=seq,
-            t_ns=self._to_ns(t_s) if self._epoch_ns is not None else 0,
-            origin=self.origin,
-            track_id=np.where(known.confirmed[rows], known.link[rows], self._tentative_id(rows)),
-            epoch=np.zeros(len(rows), "<u4"),
-            status=frames.status_of(self._system, rows, t_s, _COASTING_AFTER_PERIODS * longest),
-            state=state,
-            covariance=covariance,
-            height_m=None,
-            height_variance_m2=None,
-            model_probability=mu,
-            models=self._models,
-            manoeuvre_fit=frames.manoeuvre_fit(mu, self._manoeuvre_models),
-            sensors=list(self.sensors),
-            members=known.member[rows][:, : len(self.sensors)].copy(),
-            updated_t_ns=self._to_ns_array(known.last_s[rows]),
-            first_t_ns=self._to_ns_array(known.first_s[rows]),
-        )
-
-    def _note_ended(self, ended: list[tuple[int, int, int]]) -> None:
-        """Keep the last words of tracks that ended for the next frame."""
-        if not ended:
-            return
-        rows = np.array([row for row, _, _ in ended], np.int64)
-        frame = self._frame_of(rows, self._now_s, self._seq)
-        status = np.full(len(rows), ENDED, np.uint8)
-        self._ended.append(frame.model_copy(update={"status": status}))
-        self.counters["ended"] += len(rows)
-
-    def _take_ended(self) -> list[TrackFrame]:
-        ended, self._ended = self._ended, []
-        return ended
-
-    # --- time, numbers ---
-
-    def _advance(self, t_s: float) -> None:
-        self._now_s = max(self._now_s, t_s)
-
-    def _to_s(self, t_ns: int) -> float:
-        if self._epoch_ns is None:
-            self._epoch_ns = t_ns - t_ns % 1_000_000_000
-            self._next_track = self._next_track or max(1, self._epoch_ns // 1_000_000 - TRACK_EPOCH_MS)
-        return (t_ns - self._epoch_ns) / 1e9
-
-    def _to_s_array(self, t_ns: IntArray) -> npt.NDArray[np.float64]:
-        self._to_s(int(t_ns.min()))
-        return np.asarray((t_ns - (self._epoch_ns or 0)) / 1e9)
-
-    def _to_ns(self, t_s: float) -> int:
-        return round(t_s * 1e9) + (self._epoch_ns or 0)
-
-    def _to_ns_array(self, t_s: npt.NDArray[np.float64]) -> IntArray:
-        return np.rint(t_s * 1e9).astype(np.int64) + (self._epoch_ns or 0)
-
-    def _tentative_id(self, rows: IntArray) -> IntArray:
-        # Tentative tracks have no public number yet; theirs is of a range that confirmed ones never reach.
-        return (self.unit.number << _TRACK_BITS) | (1 << (_TRACK_BITS - 1)) | self._system.life.uid[rows]
+        self._frame_s = self._time.now_s
+        return self._picture.next_frame()
 
     def _rules(self, period_s: float, coast_s: float) -> Rules:
         s = self.settings

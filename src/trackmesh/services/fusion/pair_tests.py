@@ -114,8 +114,7 @@ class SumTest:
         found = candidates(a, b, self._sums.key)
         distance, _ = distances(a, b, found, blur)
         before, looks = self._recall(found.key)
-        # An infinite distance rejects for good, and must stay a number.
-        statistic = sequential_statistic(before, np.minimum(distance, 1e6))
+        statistic = sequential_statistic(before, distance)
         limit = self._limit(looks + 1)
         self._sums = _Sums(found.key, statistic, looks + 1)
         declared = one_to_one(a, b, found, np.where(statistic <= limit, 2.0 - statistic / limit, 0.0))

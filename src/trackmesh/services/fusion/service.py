@@ -16,8 +16,9 @@ from trackmesh.protocol.keys import kind_and_id, last_chunk
 from trackmesh.protocol.messages import PlotBatch, SensorHealth, SensorInfo, TrackFrame, TrackQuery
 from trackmesh.protocol.serving import answers
 from trackmesh.services.fusion.black_box import BlackBox
-from trackmesh.services.fusion.engine import TRACK_EPOCH_MS, FusionEngine, Unit
+from trackmesh.services.fusion.engine import FusionEngine, Unit
 from trackmesh.services.fusion.intake import Intake
+from trackmesh.services.fusion.picture import TRACK_EPOCH_MS
 from trackmesh.services.fusion.settings import FusionSettings
 from trackmesh.services.fusion.warm_up import warm_up
 from trackmesh.services.runtime import Health, ServiceRuntime
