@@ -100,9 +100,15 @@ def _stonesoup(seed: int) -> None:
     print(f"stonesoup seed {seed}: {(done.stdout or done.stderr).strip().splitlines()[-1]}")
 
 
-def _seeds(text: str) -> list[int]:
+def seeds_of(text: str) -> list[int]:
+    """Seeds as in ``1,11-31``."""
     parts = (part.partition("-") for part in text.split(","))
     return [seed for low, _, high in parts for seed in range(int(low), int(high or low) + 1)]
+
+
+def settings_of(texts: list[str]) -> dict[str, Any]:
+    """Settings as in ``gate=25``, the values JSON."""
+    return {name: json.loads(value) for name, _, value in (text.partition("=") for text in texts)}
 
 
 def main() -> None:
@@ -115,11 +121,10 @@ def main() -> None:
     ask.add_argument("--set", action="append", default=[], metavar="NAME=JSON")
     ask.add_argument("--stonesoup", action="store_true")
     given = ask.parse_args()
-    changes = {name: json.loads(value) for name, _, value in (s.partition("=") for s in given.set)}
-    settings = EngineSettings(**changes)
+    settings = EngineSettings(**settings_of(given.set))
     run(peer_scenario.make(1, 5, given.sectors, 60.0), settings)
     scores = []
-    for seed in _seeds(given.seeds):
+    for seed in seeds_of(given.seeds):
         found = run(peer_scenario.make(seed, given.targets, given.sectors, given.duration), settings)
         scores.append([found.score[n] for n in ("gospa_m", "rmse_m", "id_switches", "missed", "false")])
         print(f"seed {seed}: {_line(found)}", flush=True)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -14,6 +17,9 @@ from trackmesh.protocol.messages import ENDED, PlotBatch, ScanPart, SensorInfo, 
 
 PEERS = Path(__file__).resolve().parents[2] / "shared" / "peers"
 START_NS = 1_700_000_000_000_000_000
+
+Rearrange = Callable[[Any, Any], Any]
+"""Makes another truth (k, n, 4) of the times (k,) and the truth that the scenario draws."""
 
 
 class Case(NamedTuple):
@@ -34,10 +40,25 @@ def available() -> bool:
     return (PEERS / "scenario.py").exists()
 
 
-def make(seed: int, n_targets: int = 50, sectors: int = 1, duration_s: float = 300.0) -> Case:
-    """The scenario as messages; plots carry the time of their batch, as the peers saw them."""
-    scenario = _module("scenario").make(seed, n_targets=n_targets, sectors=sectors, duration_s=duration_s)
-    batches = [_batch(scenario.radars[s.radar].name, seq, s, sectors) for seq, s in enumerate(scenario.scans)]
+def make(
+    seed: int,
+    n_targets: int = 50,
+    sectors: int = 1,
+    duration_s: float = 300.0,
+    *,
+    radars: dict[str, float] | None = None,
+    rearrange: Rearrange | None = None,
+) -> Case:
+    """The scenario as messages; plots carry the time of their batch, as the peers saw them.
+
+    ``radars`` changes parameters of both radars (``p_detect``, ``clutter_per_scan``); ``rearrange`` makes another truth
+    of the scenario's before it is observed.
+    """
+    module = _module("scenario")
+    both = tuple(replace(radar, **radars or {}) for radar in module.RADARS)
+    with _truth(module, rearrange):
+        scenario = module.make(seed, n_targets=n_targets, sectors=sectors, duration_s=duration_s, radars=both)
+    batches = [_batch(scenario.radars[s.radar], seq, s, sectors) for seq, s in enumerate(scenario.scans)]
     return Case(scenario, [_sensor(r) for r in scenario.radars], batches)
 
 
@@ -64,6 +85,22 @@ def _module(name: str) -> ModuleType:
     return module
 
 
+@contextmanager
+def _truth(module: ModuleType, rearrange: Rearrange | None) -> Iterator[None]:
+    """The scenario takes no truth from outside: for the time of the block it draws another one."""
+    drawn = module.make_truth
+
+    def rearranged(*args: Any, **kwargs: Any) -> Any:
+        t_s, truth = drawn(*args, **kwargs)
+        return t_s, truth if rearrange is None else rearrange(t_s, truth)
+
+    module.make_truth = rearranged  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        module.make_truth = drawn  # type: ignore[attr-defined]
+
+
 def _sensor(radar: Any) -> SensorInfo:
     return SensorInfo(
         sensor_id=radar.name,
@@ -76,14 +113,15 @@ def _sensor(radar: Any) -> SensorInfo:
     )
 
 
-def _batch(name: str, seq: int, scan: Any, sectors: int) -> PlotBatch:
+def _batch(radar: Any, seq: int, scan: Any, sectors: int) -> PlotBatch:
     n = len(scan.range_m)
+    turn, sector = divmod(round((scan.time_s - radar.offset_s) / radar.period_s * sectors), sectors)
     return PlotBatch(
-        sensor_id=name,
+        sensor_id=radar.name,
         boot_id="bench",
         seq=seq,
         t_ns=np.full(n, START_NS + round(scan.time_s * 1e9)),
         columns=["range_m", "azimuth_rad"],
         values=np.stack([scan.range_m, scan.azimuth_rad], axis=1).reshape(n, 2),
-        scan=ScanPart(index=seq, sector=0, sectors=sectors),
+        scan=ScanPart(index=turn, sector=sector, sectors=sectors),
     )

@@ -62,6 +62,25 @@ def test_the_score_of_a_recording(good: Run, recording: Path) -> None:
     assert "gospa_m" in table and "id_switches" in table
 
 
+def test_scores_over_time_as_a_table_and_a_picture(good: Run, recording: Path, tmp_path: Path) -> None:
+    files, table, picture = (
+        (recording / "tracks.jsonl", recording / "truth.jsonl"),
+        tmp_path / "s.csv",
+        tmp_path / "s.png",
+    )
+    figures = json.loads(good("score", *files, "--csv", table, "--plot", picture, "--json").stdout)
+    names, *rows = [line.split(",") for line in table.read_text().splitlines()]
+    scored = [dict(zip(names, row, strict=True)) for row in rows if row[names.index("scored")] == "1"]
+    assert len(scored) == figures["frames"]
+    for name in ("gospa_m", "gospa_switching_m", "ospa_m"):
+        mean = sum(float(row[name]) for row in scored) / len(scored)
+        assert mean == pytest.approx(figures[name], rel=1e-6)
+    assert picture.read_bytes().startswith(b"\x89PNG") and picture.stat().st_size > 10_000
+    dear = json.loads(good("score", *files, "--switch", 0, "--gate", 1, "--json").stdout)
+    assert dear["gospa_switching_m"] == figures["gospa_m"]
+    assert dear["siap_spuriousness"] > 0.9 and dear["gospa_m"] == figures["gospa_m"]
+
+
 def test_figures_that_do_not_exist_are_null(good: Run, recording: Path, tmp_path: Path) -> None:
     (tmp_path / "blind.toml").write_text("[engine]\nconfirm_score = 1e6\nscore_cap = 2e6\n")
     blind = tmp_path / "tracks.jsonl"

@@ -45,6 +45,8 @@ USAGE = [
     "track plots.jsonl --out x.jsonl --loud",
     "score tracks.jsonl",
     "score tracks.jsonl truth.jsonl --c=0",
+    "score tracks.jsonl truth.jsonl --switch=-1",
+    "score tracks.jsonl truth.jsonl --nearest --csv scores.csv",
     "sim",
     "sim radar --seed=-1",
     "sim radar --start-ns soon",

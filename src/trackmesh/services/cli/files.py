@@ -1,9 +1,8 @@
-"""Commands that need no network: track, score, plot, convert, schema."""
+"""Commands that need no network: track, plot, convert, schema."""
 
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -11,12 +10,11 @@ from pathlib import Path
 from typing import Annotated, TypeVar
 
 import typer
-from rich.table import Table
 
 from trackmesh.protocol.errors import TrackmeshError
 from trackmesh.protocol.files import RecordWriter, read_records
 from trackmesh.protocol.messages import MESSAGES, Message, TrackFrame, TruthFrame
-from trackmesh.services.cli.options import AsJson, Config, err, out, say, told
+from trackmesh.services.cli.options import Config, err, say, told
 from trackmesh.services.cli.progress import progress_bar
 
 M = TypeVar("M", bound=Message)
@@ -56,8 +54,8 @@ def track(
         file = opened.enter_context(RecordWriter(out_path))
         if refined is not None:
             run.on_refined = opened.enter_context(RecordWriter(refined)).write
-        advance = opened.enter_context(progress_bar("tracking", _lines(plots)))
-        for frame in run.frames(_counted(read_records(plots), advance)):
+        advance = opened.enter_context(progress_bar("tracking", lines_of(plots)))
+        for frame in run.frames(counted(read_records(plots), advance)):
             file.write(frame)
             count += 1
     spent_s = time.process_time() - started_s
@@ -65,13 +63,15 @@ def track(
     say(f"{count} frames of {run.plots} plots in {out_path}, {spent_s:.1f} s of CPU{'; ' + refused if refused else ''}")
 
 
-def _counted(records: Iterator[Message], advance: Callable[[float], None]) -> Iterator[Message]:
-    for number, record in enumerate(records):
+def counted(records: Iterator[M], advance: Callable[[float], None]) -> Iterator[M]:
+    """The records, each told to a progress bar when it is done with."""
+    for number, record in enumerate(records, 1):
         yield record
         advance(number)
 
 
-def _lines(path: Path) -> int | None:
+def lines_of(path: Path) -> int | None:
+    """How many lines a file has, for a progress bar; None where nobody would see one."""
     if not err.is_terminal:
         return None
     try:
@@ -79,44 +79,6 @@ def _lines(path: Path) -> int | None:
             return sum(1 for _ in file)
     except OSError:
         return None
-
-
-@told
-def score(
-    tracks: Tracks,
-    truth: Annotated[Path, typer.Argument(metavar="TRUTH.jsonl", help="Where the targets really were.")],
-    as_json: AsJson = False,
-    c_m: Annotated[
-        float, typer.Option("--c", min=1e-3, metavar="M", help="Cut-off distance of GOSPA and OSPA, metres.")
-    ] = 1000.0,
-    warmup_s: Annotated[
-        float, typer.Option("--warmup", min=0.0, metavar="S", help="Seconds not scored at the start.")
-    ] = 40.0,
-    nearest: Annotated[
-        bool, typer.Option("--nearest", help="Score the nearest track of each target: for truth of some targets only.")
-    ] = False,
-) -> None:
-    """Score tracks against the truth. By GOSPA, OSPA, RMSE, NEES and identity switches."""
-    from trackmesh.sim.scoring import score_nearest, score_tracks
-
-    if nearest:
-        figures = score_nearest(records_of(tracks, TrackFrame), records_of(truth, TruthFrame), c_m).as_dict()
-    else:
-        with progress_bar("scoring", _lines(tracks)) as advance:
-            summary = score_tracks(
-                records_of(tracks, TrackFrame), records_of(truth, TruthFrame), c_m, warmup_s, advance
-            )
-        figures = summary.as_dict()
-    if not figures["frames"]:
-        raise TrackmeshError(f"No frame of {tracks} is to be scored: all lie outside the truth or within the warm-up.")
-    if as_json:
-        # JSON knows no NaN.
-        print(json.dumps({name: value if math.isfinite(value) else None for name, value in figures.items()}))
-        return
-    table = Table("figure", "value", title=f"{tracks} against {truth}", title_justify="left")
-    for name, value in figures.items():
-        table.add_row(name, f"{value}" if isinstance(value, int) else f"{value:.4g}")
-    out.print(table)
 
 
 @told

@@ -9,6 +9,7 @@ import typer
 
 from trackmesh.services.cli import files, network, services, studies
 from trackmesh.services.cli.demo import demo
+from trackmesh.services.cli.scoring import score
 from trackmesh.services.cli.tuning import tune
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -36,7 +37,7 @@ for command in (
     demo,
     *(services.router, services.fusion, services.emi),
     *(network.watch, network.tracks, network.sensors, network.status, network.play, network.invert),
-    *(files.track, files.score, tune, files.plot, files.schema, studies.study),
+    *(files.track, score, tune, files.plot, files.schema, studies.study),
 ):
     app.command()(command)
 app.add_typer(services.sim, name="sim")

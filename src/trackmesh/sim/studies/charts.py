@@ -38,6 +38,8 @@ def save(figure: Figure, out: Path) -> Path:
         figure.savefig(out, dpi=150, bbox_inches="tight", pad_inches=0.25)
     except OSError as error:
         raise TrackmeshError(f"Cannot write {out}: {error.strerror or error}.") from None
+    except ValueError as error:
+        raise TrackmeshError(f"Cannot draw into {out}: {error}.") from None
     return out
 
 
