@@ -29,7 +29,7 @@ ENDED, COASTING, CONFIRMED, TENTATIVE = 3, 2, 1, 0
 POLAR, PLANE, GEODETIC = ["range_m", "azimuth_rad"], ["east_m", "north_m"], ["latitude_deg", "longitude_deg"]
 RULES = Rules(
     confirm_score=12.0, confirm_hits=3, score_cap=30.0, drop_score=-2.0, drop_fall=6.0, max_misses=3,
-    tentative_age_s=9.0, coast_s=15.0,
+    tentative_age_s=9.0, coast_s=15.0, end_fall=1000.0,
 )  # fmt: skip
 
 

@@ -133,7 +133,7 @@ def test_a_lost_track_coasts_and_ends_once() -> None:
 def test_ids_are_never_used_again() -> None:
     """Every 12 s the targets are elsewhere: in one and the same batch tracks end and new ones begin."""
     info = radar(period_s=2.0)
-    tracker = engine(info, coast_s=3.0, publish_tentative=True)
+    tracker = engine(info, coast_s=3.0, stitch_s=0.0, publish_tentative=True)
     over: set[int] = set()
     known: set[int] = set()
     for k, t in enumerate(np.arange(0.0, 120.0, 2.0).tolist()):
@@ -315,7 +315,7 @@ def test_of_a_batch_only_the_plots_that_are_too_late_are_dropped() -> None:
 
 
 def test_ticks_alone_make_tracks_coast_and_end() -> None:
-    tracker = engine(NORTH, EAST, idle_frame_s=1.0)
+    tracker = engine(NORTH, EAST, idle_frame_s=1.0, stitch_s=0.0)
     drive(tracker, two_radars(until_s=40.0, p_detect=1.0))
     told: list[tuple[int, ...]] = []
     for t in np.arange(40.0, 70.0, 0.25).tolist():

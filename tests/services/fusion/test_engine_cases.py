@@ -58,7 +58,7 @@ def test_misses_and_clutter() -> None:
     assert figures("pd-70", 120.0)["gospa_m"] <= 680
     assert figures("clutter-200", 100.0)["gospa_m"] <= 500
     both = figures("pd-70-clutter-200", 200.0)
-    assert both["gospa_m"] <= 1300 and both["missed"] <= 1 and both["false"] <= 3
+    assert both["gospa_m"] <= 850 and both["missed"] <= 1 and both["false"] <= 3
 
 
 def test_formations_are_kept_apart() -> None:
@@ -77,7 +77,6 @@ def test_a_radar_may_die_for_a_while() -> None:
     assert figures("radar-dead", 150.0)["kept_pct"] >= 98
 
 
-@pytest.mark.xfail(reason="a track ends after coast_s without a plot, and what begins after the gap is another")
 @pytest.mark.parametrize("name", ["unseen-20", "blackout"])
 def test_a_gap_of_fifteen_seconds_is_bridged(name: str) -> None:
     assert figures(name, 150.0)["kept_pct"] >= 90

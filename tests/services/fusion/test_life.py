@@ -198,3 +198,15 @@ def test_plots_shared_in_a_row_are_counted() -> None:
     assert share(life, -1) == (7, 4)
     assert share(life, 8) == (8, 1)
     assert [share(life, -1), share(life, -1)] == [(8, 0), (8, 0)]
+
+
+def test_a_confirmed_track_that_lives_on_clutter_ends_by_its_score() -> None:
+    rules = RULES._replace(end_fall=9.0)
+    life = begun()
+    for t in (4.0, 8.0, 12.0, 16.0):
+        hit(life, t, gain=8.0)
+    assert judged(life, 16.0, rules) == ([0], [])
+    hit(life, 20.0, gain=-8.9)
+    assert judged(life, 20.0, rules) == ([], [])
+    hit(life, 24.0, gain=-0.2)
+    assert judged(life, 24.0, rules) == ([], [0])

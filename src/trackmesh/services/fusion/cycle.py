@@ -18,11 +18,12 @@ import numpy.typing as npt
 from trackmesh.services.estimation.bias import Tracks
 from trackmesh.services.estimation.bias_start import BiasStart, global_start
 from trackmesh.services.estimation.lookup import index_of
-from trackmesh.services.estimation.pairs import PairRules, state_distances
+from trackmesh.services.estimation.pairs import state_distances
 from trackmesh.services.fusion import membership
-from trackmesh.services.fusion.association import NUMBER_MASK, Blur, DeclaredPairs, LocalTracks, SequentialTest
+from trackmesh.services.fusion.association import NUMBER_MASK, Blur, DeclaredPairs, LocalTracks
 from trackmesh.services.fusion.biases import Change
 from trackmesh.services.fusion.layer import Layer
+from trackmesh.services.fusion.pair_tests import PairTest
 from trackmesh.services.fusion.registration import Registration
 
 IntArray = npt.NDArray[np.int64]
@@ -53,17 +54,17 @@ class AssociationCycle:
         system: Layer,
         locals_: list[Layer],
         registration: Registration | None,
-        rules: PairRules,
+        new_test: Callable[[], PairTest],
         counters: Counter[str],
         end: Callable[[int], None],
     ) -> None:
         self._system = system
         self._locals = locals_
         self._registration = registration
-        self._rules = rules
+        self._new_test = new_test
         self._counters = counters
         self._end = end
-        self._tests: dict[tuple[int, int], SequentialTest] = {}
+        self._tests: dict[tuple[int, int], PairTest] = {}
         self.declared: list[Declared] = []
 
     def run(self, sensors: list[str], now_s: float) -> list[Change]:
@@ -76,7 +77,9 @@ class AssociationCycle:
         self.declared = []
         for b in range(len(seen)):
             for a in range(b):
-                test = self._tests.setdefault((a, b), SequentialTest(self._rules))
+                if (a, b) not in self._tests:
+                    self._tests[a, b] = self._new_test()
+                test = self._tests[a, b]
                 pairs = test.cycle(seen[a], seen[b], now_s, self._blur(sensors[a], sensors[b]))
                 self.declared.append(Declared(a, b, seen[a].row[pairs.a], seen[b].row[pairs.b]))
                 self._teach(sensors[a], sensors[b], seen[a], seen[b], pairs, now_s)

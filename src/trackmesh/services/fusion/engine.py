@@ -22,7 +22,6 @@ from trackmesh.protocol.messages import (
     TrackFrame,
     TrackQuery,
 )
-from trackmesh.services.estimation.pairs import PairRules
 from trackmesh.services.estimation.plots import Plots
 from trackmesh.services.fusion import frames, life
 from trackmesh.services.fusion.biases import Change, moved
@@ -34,6 +33,7 @@ from trackmesh.services.fusion.picture import Picture, Unit
 from trackmesh.services.fusion.restart import picture_of
 from trackmesh.services.fusion.sensors import Sensor
 from trackmesh.services.fusion.settings import EngineSettings
+from trackmesh.services.fusion.stitching import Stitching
 from trackmesh.services.fusion.timeline import Timeline
 
 __all__ = ["FusionEngine", "Unit"]
@@ -68,12 +68,12 @@ class FusionEngine:
         self._locals: list[Layer] = []
         self.corrections = Corrections(settings.registration_rules() if settings.registration else None)
         self._registration_due = False
-        pair_rules = PairRules(speed_mps=settings.pair_speed_mps, radius_m=settings.pair_radius_m)
         self._cycle = AssociationCycle(
-            self._system, self._locals, self.corrections.biases, pair_rules, self.counters, self._end
+            self._system, self._locals, self.corrections.biases, settings.pair_test, self.counters, self._end
         )
         self._picture = Picture(settings, unit, self._system, self.sensors, self._time)
         self._picture.origin = origin
+        self._stitching = Stitching(self._system, settings.stitch_s, settings.stitch_q_m2ps3)
         self._cycle_s = -np.inf
         self._frame_s = -np.inf
 
@@ -126,7 +126,7 @@ class FusionEngine:
         self._time.advance(self._time.to_s(t_ns))
         confirmed, ended = self._system.judge(self._time.now_s)
         self._name(confirmed)
-        self._note_ended(ended)
+        self._note_lost(ended)
         for local in self._locals:
             local.judge(self._time.now_s)
         self._cycle_if_due()
@@ -200,7 +200,7 @@ class FusionEngine:
         self.counters["repairs"] = self._system.filters.repairs + sum(one.filters.repairs for one in self._locals)
         life.share(local.life, got.row, self._system.life.uid[fed.row])
         self._name(fed.confirmed)
-        self._note_ended(fed.ended)
+        self._note_lost(fed.ended)
         self._cycle_if_due()
 
     def _look(self, sensor: Sensor, index: int, plots: Plots, sectors: int, density: float) -> Look:
@@ -220,13 +220,23 @@ class FusionEngine:
         )
 
     def _name(self, rows: IntArray) -> None:
-        """Give newly confirmed system tracks their public numbers."""
-        self._picture.name(rows)
-        self.counters["confirmed"] += len(rows)
+        """Give newly confirmed system tracks their public numbers: those of lost tracks that they continue, or new."""
+        taken, numbers, dropped = self._stitching.take_over(rows, self._time.now_s)
+        self._picture.name(rows[~np.isin(rows, taken)])
+        self._system.life.link[taken] = numbers
+        for row in dropped.tolist():
+            self._system.drop(row)
+        self.counters["confirmed"] += len(rows) - len(taken)
+        self.counters["stitched"] += len(taken)
 
-    def _note_ended(self, ended: list[tuple[int, int, int]]) -> None:
-        self._picture.note_ended(np.array([row for row, _, _ in ended], np.int64))
-        self.counters["ended"] += len(ended)
+    def _note_lost(self, ended: list[tuple[int, int, int]]) -> None:
+        """Rows had no plot for too long; and tell of those of earlier whose time is over."""
+        if ended:
+            rows = np.array([row for row, _, _ in ended], np.int64)
+            self._stitching.lose(rows, self._picture.last_words(rows))
+        gone = self._stitching.gone(self._time.now_s)
+        self._picture.tell(gone)
+        self.counters["ended"] += len(gone)
 
     # --- the association cycle ---
 
@@ -262,7 +272,8 @@ class FusionEngine:
     def _end(self, row: int) -> None:
         known = self._system.life
         if known.confirmed[row]:
-            self._note_ended([(row, int(known.uid[row]), int(known.link[row]))])
+            self._picture.tell([self._picture.last_words(np.array([row]))])
+            self.counters["ended"] += 1
         self._system.drop(row)
 
     def _due_frame(self, period_s: float) -> TrackFrame | None:
@@ -275,5 +286,5 @@ class FusionEngine:
         s = self.settings
         return Rules(
             s.confirm_score, s.confirm_hits, s.score_cap, s.drop_score, s.drop_fall, s.max_misses,
-            _TENTATIVE_AGE_PERIODS * period_s, coast_s,
+            _TENTATIVE_AGE_PERIODS * period_s, coast_s, s.end_fall,
         )  # fmt: skip

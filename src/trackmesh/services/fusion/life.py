@@ -3,7 +3,7 @@
 | status | entered | left |
 |---|---|---|
 | tentative | one plot that no track took | confirmed, or dropped |
-| confirmed | score above ``confirm_score`` and ``confirm_hits`` plots | ended: no plot for ``coast_s`` |
+| confirmed | score above ``confirm_score`` and ``confirm_hits`` plots | ended: no plot for ``coast_s``, or score ``end_fall`` below its best |
 
 A tentative track is dropped when its score is below ``drop_score`` or ``drop_fall`` below its best, after
 ``max_misses`` misses in a row, or ``tentative_age_s`` after its last plot.
@@ -72,6 +72,7 @@ class Rules(NamedTuple):
     max_misses: int
     tentative_age_s: float
     coast_s: float
+    end_fall: float
 
 
 def make_life(n: int, s: int) -> Life:
@@ -197,7 +198,7 @@ def judge(
     for i in rows:
         age = t_s - life.last_s[i]
         if life.confirmed[i]:
-            over = age > rules.coast_s
+            over = age > rules.coast_s or life.score[i] < life.best[i] - rules.end_fall
         elif life.score[i] > rules.confirm_score and life.hits[i] >= rules.confirm_hits:
             life.confirmed[i] = True
             confirmed[n_confirmed] = i

@@ -71,12 +71,14 @@ class Picture:
         self._system.life.link[rows] = (self._unit.number << _TRACK_BITS) | (self.next_track + np.arange(len(rows)))
         self.next_track += len(rows)
 
-    def note_ended(self, rows: IntArray) -> None:
-        """Keep the last words of rows that end for the next frame."""
-        if not len(rows):
-            return
+    def last_words(self, rows: IntArray) -> TrackFrame:
+        """What is to be told of rows that end now."""
         frame = self._frame_of(rows, self._time.now_s, self.seq)
-        self._ended.append(frame.model_copy(update={"status": np.full(len(rows), ENDED, np.uint8)}))
+        return frame.model_copy(update={"status": np.full(len(rows), ENDED, np.uint8)})
+
+    def tell(self, words: list[TrackFrame]) -> None:
+        """Put last words into the next frame."""
+        self._ended += words
 
     def next_frame(self) -> TrackFrame:
         """The present picture, as it is published."""

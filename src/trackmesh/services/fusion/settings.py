@@ -14,8 +14,10 @@ from trackmesh.services.estimation.alpha_beta_tracks import AlphaBetaTracks
 from trackmesh.services.estimation.bank import Branch, make_models
 from trackmesh.services.estimation.filters import FilterName, generic_models, manoeuvre_models, velocity_models
 from trackmesh.services.estimation.imm_tracks import ImmTracks
+from trackmesh.services.estimation.pairs import PairRules
 from trackmesh.services.fusion.biases import RegistrationRules
 from trackmesh.services.fusion.layer import TrackFilters
+from trackmesh.services.fusion.pair_tests import PairTest, TestName, make_test
 from trackmesh.services.runtime import ServiceSettings
 
 
@@ -47,14 +49,21 @@ class EngineSettings(BaseModel):
         0, description="publish, beside the picture, states refined by this many later plots"
     )
     sigma_velocity_mps: Positive = Field(150.0, description="velocity of a new track, one sigma per axis")
-    gate: Positive = Field(16.0, description="largest squared Mahalanobis distance of a plot to a track's model")
+    gate: Positive = Field(14.0, description="largest squared Mahalanobis distance of a plot to a track's model")
     confirm_score: Positive = Field(12.0, description="log-likelihood ratio that confirms a track")
     confirm_hits: Annotated[int, Field(ge=1)] = Field(3, description="plots a track needs to be confirmed")
     score_cap: Positive = 30.0
     drop_score: Annotated[float, Field(lt=0)] = -2.0
     drop_fall: Positive = 6.0
+    end_fall: Positive = Field(
+        9.0, description="a confirmed track ends when its score is so far below its best: it lives on clutter"
+    )
     max_misses: Annotated[int, Field(ge=1)] = 3
     coast_s: Positive = Field(15.0, description="a confirmed track ends after this time without a plot")
+    stitch_s: NonNegative = Field(
+        40.0, description="a new track may take over the number of one whose last plot is not older than this; 0: never"
+    )
+    stitch_q_m2ps3: Positive = Field(200.0, description="acceleration noise over the gap that is bridged so")
     local_coast_periods: Positive = 4.0
     ring_system: Annotated[int, Field(ge=2, le=512)] = Field(
         32, description="plots a system track keeps, of which the younger half can always be replayed"
@@ -62,6 +71,13 @@ class EngineSettings(BaseModel):
     ring_local: Annotated[int, Field(ge=2, le=512)] = 16
     max_lateness_s: Positive = Field(10.0, description="plots older than this are dropped and counted")
     cycle_s: Positive = Field(2.0, description="association cycle")
+    association: TestName = Field("seqllr", description="the test of whether local tracks are of one target")
+    association_alpha: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
+        0.001, description="gnn, paper-sequential: share of true pairs that chi-square rejects"
+    )
+    noise_tails: Literal["student", "gaussian"] = Field(
+        "student", description="seqllr: how differences of tracks of one target are distributed"
+    )
     pair_speed_mps: Positive = Field(250.0, description="spread of velocities expected of unrelated tracks, per axis")
     pair_radius_m: Positive = Field(10_000.0, description="radius in which the density of tracks is counted")
     registration: bool = Field(True, description="estimate the sensors' biases, and correct plots once they are known")
@@ -91,6 +107,13 @@ class EngineSettings(BaseModel):
     def local_tracks(self, rows: int) -> TrackFilters:
         """Filters for the local tracks of one sensor."""
         return self._tracks(self.local_filter, rows, self.ring_local, 0)
+
+    def pair_test(self) -> PairTest:
+        """A new test between the local tracks of two sensors."""
+        rules = PairRules(speed_mps=self.pair_speed_mps, radius_m=self.pair_radius_m)
+        if self.noise_tails == "gaussian":
+            rules = rules._replace(nu=np.inf)
+        return make_test(self.association, rules, self.association_alpha)
 
     def registration_rules(self) -> RegistrationRules:
         """What to expect of biases."""
