@@ -28,9 +28,16 @@ def benches() -> dict[str, Bench]:
     """Every benchmark by its name; a new one is a new entry."""
     # A script's own directory is on the path, not that of the package it lies in.
     sys.path.insert(0, str(HERE.parent))
-    from benchmarks import alpha_beta, emi, fusion, imm, wire
+    from benchmarks import alpha_beta, association, emi, fusion, imm, wire
 
-    return {"wire": wire.rows, "fusion": fusion.rows, "emi": emi.rows, "alpha-beta": alpha_beta.rows, "imm": imm.rows}
+    return {
+        "wire": wire.rows,
+        "fusion": fusion.rows,
+        "association": association.rows,
+        "emi": emi.rows,
+        "alpha-beta": alpha_beta.rows,
+        "imm": imm.rows,
+    }
 
 
 def machine() -> str:

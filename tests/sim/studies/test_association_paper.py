@@ -174,6 +174,13 @@ def test_rows_are_the_agreed_ones(shares: Shares) -> None:
     assert "6 of 6 on fresh seeds" in result.notes[0]
 
 
+def test_with_the_errors_of_a_radar_nothing_is_confused() -> None:
+    setting = SETTING._replace(
+        noise_m=500.0, interference_m=500.0, process_noise_m=30.0, process_interference_m=30.0, scan_s=4.0
+    )
+    assert min(values.mean() for values in simulate(10, 6, setting=setting).values()) > 99.5
+
+
 def test_more_targets_are_confused_more(shares: Shares) -> None:
     for method in METHODS:
         few, some, many = (shares[Key(method, "gaussian", count)].mean() for count in COUNTS)

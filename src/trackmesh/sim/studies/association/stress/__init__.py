@@ -1,0 +1,1 @@
+"""Tests of association on the tracks of two simulated radars, in cases of growing difficulty."""
