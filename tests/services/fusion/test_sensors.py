@@ -10,7 +10,7 @@ from tests.services.fusion.makers import GEODETIC, POLAR, FloatArray, batch, pos
 
 from trackmesh.protocol.errors import RefusedMessage
 from trackmesh.protocol.messages import Geodetic
-from trackmesh.services.fusion.sensors import ClutterDensity, Sensor
+from trackmesh.services.fusion.sensors import Sensor
 
 ORIGIN = Geodetic(latitude_deg=50.0, longitude_deg=8.0, height_m=100.0)
 AWAY = Geodetic(latitude_deg=50.6, longitude_deg=9.1, height_m=300.0)
@@ -135,45 +135,3 @@ def test_plots_that_cannot_be_placed_are_refused(reason: str, change: dict[str, 
 
 
 # --- clutter ---
-
-
-AREA_M2 = 1e10
-
-
-def test_clutter_is_learnt_and_followed() -> None:
-    clutter = ClutterDensity(AREA_M2, None)
-    for _ in range(60):
-        clutter.add(20, 1.0)
-    assert clutter.value(0, 1.0) == pytest.approx(20 / AREA_M2)
-    for _ in range(60):
-        clutter.add(5, 1.0)
-    assert clutter.value(0, 1.0) == pytest.approx(5 / AREA_M2, rel=1e-3)
-
-
-def test_sectors_add_up_to_looks() -> None:
-    whole, parts = ClutterDensity(AREA_M2, None), ClutterDensity(AREA_M2, None)
-    for _ in range(40):
-        whole.add(32, 1.0)
-        for _ in range(32):
-            parts.add(1, 1 / 32)
-    assert parts.value(0, 1 / 32) == pytest.approx(whole.value(0, 1.0), rel=1e-9)
-
-
-def test_before_anything_was_counted_all_plots_are_clutter() -> None:
-    assert ClutterDensity(AREA_M2, None).value(50, 1.0) == pytest.approx(50 / AREA_M2)
-    assert ClutterDensity(AREA_M2, None).value(3, 1 / 32) == pytest.approx(96 / AREA_M2)
-
-
-def test_a_declared_density_is_where_it_begins() -> None:
-    clutter = ClutterDensity(AREA_M2, 7 / AREA_M2)
-    assert clutter.value(500, 1.0) == pytest.approx(7 / AREA_M2)
-    for _ in range(100):
-        clutter.add(20, 1.0)
-    assert clutter.value(0, 1.0) == pytest.approx(20 / AREA_M2, rel=1e-3)
-
-
-def test_a_clear_sky_is_never_quite_clear() -> None:
-    clutter = ClutterDensity(AREA_M2, None)
-    for _ in range(100):
-        clutter.add(0, 1.0)
-    assert clutter.value(0, 1.0) == pytest.approx(0.5 / AREA_M2)

@@ -29,7 +29,8 @@ TrackId = Annotated[int, Field(ge=0, le=2**53)]
 _UPPER = np.triu_indices(6)
 
 
-def _symmetric(upper: npt.NDArray[np.float32]) -> FloatArray:
+def symmetric(upper: npt.NDArray[np.float32]) -> FloatArray:
+    """Upper triangles (n, 21), row by row, as full matrices (n, 6, 6)."""
     full = np.zeros((len(upper), 6, 6))
     full[:, _UPPER[0], _UPPER[1]] = upper
     full[:, _UPPER[1], _UPPER[0]] = upper
@@ -69,7 +70,7 @@ class TrackFrame(TopMessage):
 
     def covariance_matrices(self) -> FloatArray:
         """Covariances as full symmetric matrices, shape (n, 6, 6)."""
-        return _symmetric(self.covariance)
+        return symmetric(self.covariance)
 
 
 class RefinedFrame(TopMessage):
@@ -91,7 +92,7 @@ class RefinedFrame(TopMessage):
 
     def covariance_matrices(self) -> FloatArray:
         """Covariances as full symmetric matrices, shape (n, 6, 6)."""
-        return _symmetric(self.covariance)
+        return symmetric(self.covariance)
 
 
 class TrackQuery(TopMessage):
@@ -145,7 +146,8 @@ class BandFrame(TopMessage):
 class SensorBias(Message):
     """One sensor's estimated bias: [range_m, azimuth_rad] of a radar, [east_m, north_m] of a position sensor.
 
-    What it measures minus what is true. ``notes`` say which of it the data cannot tell, and why.
+    What it measures minus what is true. ``time_offset_s`` is what has to be added to its times (0 with the sigma 0
+    where clocks are taken to be right). ``notes`` say which of it the data cannot tell, and why.
     """
 
     sensor_id: Id
@@ -156,6 +158,8 @@ class SensorBias(Message):
     pairs: Count
     jumps: Count
     notes: Annotated[list[str], Field(max_length=16, fail_fast=True)] = []
+    time_offset_s: Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)] = 0.0
+    time_offset_sigma_s: Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)] = 0.0
 
 
 class Registration(TopMessage):

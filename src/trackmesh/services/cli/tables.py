@@ -93,6 +93,8 @@ def bias_text(bias: SensorBias) -> str:
             parts.append(f"{what} {np.rad2deg(value):.2f} ± {np.rad2deg(error):.2f} deg")
         else:
             parts.append(f"{what} {value:.0f} ± {error:.0f} {unit}")
+    if bias.time_offset_sigma_s:
+        parts.append(f"clock {bias.time_offset_s:+.2f} ± {bias.time_offset_sigma_s:.2f} s")
     text = ", ".join(parts)
     return text if bias.locked else f"({text})"
 

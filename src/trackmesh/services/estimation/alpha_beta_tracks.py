@@ -182,7 +182,7 @@ class AlphaBetaTracks:
         """None."""
         return empty_plots((0,))
 
-    def move_plots(self, sensor: int, move: Callable[[FloatArray], FloatArray]) -> None:
+    def move_plots(self, sensor: int, move: Callable[[FloatArray], FloatArray], later_s: float = 0.0) -> None:
         """Nothing: no plots are remembered."""
 
     def associate(

@@ -74,14 +74,21 @@ class ImmTracks:
         """The last plots of a row, in order of time."""
         return self.filters.ring[row, : self.filters.ring_n[row]].copy()
 
-    def move_plots(self, sensor: int, move: Callable[[FloatArray], FloatArray]) -> None:
-        """Move the remembered plots of a sensor, positions (m, 2) to (m, 2), and filter them again from the base."""
+    def move_plots(self, sensor: int, move: Callable[[FloatArray], FloatArray], later_s: float = 0.0) -> None:
+        """Move the remembered plots of a sensor in the plane and in time, and filter all again from the base.
+
+        Args:
+            sensor: whose plots.
+            move: positions (m, 2) to (m, 2).
+            later_s: added to their times; what falls before the base is forgotten.
+        """
         f = self.filters
         there = np.arange(f.ring.shape[1]) < f.ring_n[:, None]
         ours = there & (f.ring["sensor"] == sensor)
         if not ours.any():
             return
         f.ring["z"][ours] = move(f.ring["z"][ours])
+        f.ring["t_s"][ours] += later_s
         rows = np.flatnonzero(ours.any(axis=1))
         row, place = np.nonzero(there[rows])
         plots = f.ring[rows[row], place]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 import numpy.typing as npt
 
@@ -10,7 +12,7 @@ from trackmesh.protocol.files import RegistrationRecord
 from trackmesh.protocol.messages import Registration, SensorBias, SensorInfo
 from trackmesh.services.estimation.plots import Plots
 from trackmesh.services.fusion import registration
-from trackmesh.services.fusion.biases import Estimate, RegistrationRules
+from trackmesh.services.fusion.biases import Estimate, Kind, RegistrationRules
 
 
 class Corrections:
@@ -20,16 +22,21 @@ class Corrections:
         biases: the filter over the biases, or None.
     """
 
-    def __init__(self, rules: RegistrationRules | None) -> None:
+    def __init__(self, rules: RegistrationRules | None, right_clocks: Collection[str] = ()) -> None:
         self.biases = registration.Registration(rules) if rules else None
         self._ids: list[str] = []
+        self._right_clocks = frozenset(right_clocks)
 
     def announce(self, index: int, info: SensorInfo, site_m: npt.NDArray[np.float64]) -> None:
         """Take note of a sensor, by its index in the engine, or of its new place."""
         if index == len(self._ids):
             self._ids.append(info.sensor_id)
         if self.biases is not None:
-            self.biases.announce(info.sensor_id, "polar" if info.kind == "radar" else "position", site_m)
+            kind: Kind = "polar" if info.kind == "radar" else "position"
+            prior = self.biases.rules.prior(kind)
+            if info.sensor_id in self._right_clocks:
+                prior[2] = 0.0
+            self.biases.announce(info.sensor_id, kind, site_m, prior)
 
     def correct(self, plots: Plots) -> Plots:
         """Plots of one or more sensors, each corrected by what is applied to its sensor."""
@@ -46,6 +53,7 @@ class Corrections:
             return plots
         out = plots.copy()
         out["z"][which] -= self.biases.shift(self._ids[index], plots["z"][which])
+        out["t_s"][which] += self.biases.time_offset_s(self._ids[index])
         return out
 
     def message(self, unit_id: str, boot_id: str, seq: int, t_ns: int) -> Registration:
@@ -88,4 +96,6 @@ def _message(estimate: Estimate) -> SensorBias:
         pairs=estimate.pairs,
         jumps=estimate.jumps,
         notes=estimate.notes,
+        time_offset_s=estimate.time_offset_s,
+        time_offset_sigma_s=float(np.sqrt(estimate.time_offset_variance_s2)),
     )

@@ -8,6 +8,7 @@ comes with the data, and as ticks when no data comes.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +26,11 @@ from trackmesh.protocol.messages import (
 from trackmesh.services.estimation.plots import Plots
 from trackmesh.services.fusion import frames, life
 from trackmesh.services.fusion.biases import Change, moved
+from trackmesh.services.fusion.clutter import Clutter
+from trackmesh.services.fusion.composition import Composition
 from trackmesh.services.fusion.corrections import Corrections
 from trackmesh.services.fusion.cycle import AssociationCycle
+from trackmesh.services.fusion.inputs import Inputs
 from trackmesh.services.fusion.layer import Layer, Look
 from trackmesh.services.fusion.life import Rules
 from trackmesh.services.fusion.picture import Picture, Unit
@@ -51,13 +55,16 @@ class FusionEngine:
 
     Attributes:
         corrections: what is known of the sensors' biases.
+        inputs: the units whose tracks it takes; None where there are none.
         counters: what happened, by name (``plots``, ``late_plots``, ``merged``, ``contradictions``, ...).
         sensors: by id, in the order in which they were first heard of.
         log_likelihood: of all plots so far under the picture, against clutter alone: the plots that tracks took by
             their predicted density over that of clutter (the declared one, else the running estimate), and the misses.
     """
 
-    def __init__(self, settings: EngineSettings, unit: Unit, origin: Geodetic | None = None) -> None:
+    def __init__(
+        self, settings: EngineSettings, unit: Unit, origin: Geodetic | None = None, inputs: Sequence[str] = ()
+    ) -> None:
         self.settings = settings
         self.unit = unit
         self.counters: Counter[str] = Counter()
@@ -66,13 +73,20 @@ class FusionEngine:
         self._time = Timeline()
         self._system = Layer(settings.system_tracks(_ROWS), self._rules(1.0, settings.coast_s), 1, settings.gate)
         self._locals: list[Layer] = []
-        self.corrections = Corrections(settings.registration_rules() if settings.registration else None)
+        self.corrections = Corrections(
+            settings.registration_rules() if settings.registration else None, settings.right_clocks
+        )
         self._registration_due = False
         self._cycle = AssociationCycle(
             self._system, self._locals, self.corrections.biases, settings.pair_test, self.counters, self._end
         )
         self._picture = Picture(settings, unit, self._system, self.sensors, self._time)
         self._picture.origin = origin
+        self.inputs: Inputs | None = None
+        if inputs:
+            rules = settings.input_rules()
+            self.inputs = Inputs(inputs, unit.unit_id, rules, self._system, self._picture, self.counters)
+            self._picture.composition = Composition(self.inputs)
         self._stitching = Stitching(self._system, settings.stitch_s, settings.stitch_q_m2ps3)
         self._cycle_s = -np.inf
         self._frame_s = -np.inf
@@ -92,11 +106,9 @@ class FusionEngine:
         old = self.sensors.get(info.sensor_id)
         if old is not None and old.info == info:
             return
-        if self.origin is None and info.site is not None:
-            self._picture.origin = info.site
-            for known in self.sensors.values():
-                known.settle(self.origin)
-        sensor = Sensor(old.index if old else len(self.sensors), info, self.origin)
+        self._settle(info.site)
+        index = old.index if old else len(self.sensors)
+        sensor = Sensor(index, info, self.origin, clutter_areas=self.settings.clutter_areas)
         self.sensors[info.sensor_id] = sensor
         self.corrections.announce(sensor.index, info, sensor.site)
         longest = max(s.info.period_s for s in self.sensors.values())
@@ -119,11 +131,31 @@ class FusionEngine:
             raise RefusedMessage("unknown_sensor", f"Nothing is known of sensor {batch.sensor_id} yet.")
         if len(batch.t_ns):
             self._take(sensor, batch, sensor.plots(batch, self._time.to_s_array(batch.t_ns)))
+        else:
+            sensor.saw_nothing(1.0 / batch.scan.sectors if batch.scan else 1.0)
         return self._due_frame(self.settings.frame_period_s)
+
+    def tracks(self, frame: TrackFrame) -> TrackFrame | None:
+        """Take the tracks of another unit; a picture now and then, as from a tick: units must not chase each other.
+
+        Raises:
+            RefusedMessage: the unit is no input, or its frame is wrong (see ``Inputs.read``).
+        """
+        if self.inputs is None:
+            raise RefusedMessage("unknown_input", f"The unit {frame.unit_id} is no input of this one.")
+        told = self.inputs.read(frame)
+        self._settle(frame.origin)
+        t_s = self._time.to_s(frame.t_ns)
+        self._time.advance(t_s)
+        self.inputs.tell(frame, told, self.origin, t_s, self._time.to_ns(self._time.now_s))
+        return self._pass_time()
 
     def tick(self, t_ns: int) -> TrackFrame | None:
         """Let time advance without data; a picture now and then."""
         self._time.advance(self._time.to_s(t_ns))
+        return self._pass_time()
+
+    def _pass_time(self) -> TrackFrame | None:
         confirmed, ended = self._system.judge(self._time.now_s)
         self._name(confirmed)
         self._note_lost(ended)
@@ -170,6 +202,7 @@ class FusionEngine:
             "pairs": sum(len(d.row_a) for d in self._cycle.declared),
         }
         out |= {f"local_tracks.{s.info.sensor_id}": len(self._locals[s.index].rows) for s in self.sensors.values()}
+        out |= self.inputs.figures() if self.inputs else {}
         return {name: float(value) for name, value in out.items()}
 
     # --- one batch ---
@@ -183,18 +216,14 @@ class FusionEngine:
             return
         plots = plots[fresh]
         sectors = batch.scan.sectors if batch.scan else 1
-        n, share = len(plots), 1.0 / sectors
         local = self._locals[sensor.index]
-        density = sensor.local_clutter.value(n, share)
-        got = local.step(plots, self._look(sensor, 0, plots, sectors, density), self._time.now_s)
-        sensor.local_clutter.add(n - int(got.by_confirmed.sum()), share)
-        density = sensor.system_clutter.value(n, share)
-        fed = self._system.step(
-            self.corrections.correct_of(sensor.index, plots),
-            self._look(sensor, sensor.index, plots, sectors, density),
-            self._time.now_s,
-        )
-        sensor.system_clutter.add(n - int(fed.by_confirmed.sum()), share)
+        look = self._look(sensor, 0, plots, sectors, sensor.local_clutter)
+        got = local.step(plots, look, self._time.now_s)
+        sensor.local_clutter.add(plots, got.by_confirmed, 1.0 / sectors)
+        look = self._look(sensor, sensor.index, plots, sectors, sensor.system_clutter)
+        corrected = self.corrections.correct_of(sensor.index, plots)
+        fed = self._system.step(corrected, look, self._time.now_s)
+        sensor.system_clutter.add(plots, fed.by_confirmed, 1.0 / sectors)
         self.log_likelihood += fed.log_likelihood
         self.counters["late_plots"] += fed.late
         self.counters["repairs"] = self._system.filters.repairs + sum(one.filters.repairs for one in self._locals)
@@ -203,8 +232,9 @@ class FusionEngine:
         self._note_lost(fed.ended)
         self._cycle_if_due()
 
-    def _look(self, sensor: Sensor, index: int, plots: Plots, sectors: int, density: float) -> Look:
+    def _look(self, sensor: Sensor, index: int, plots: Plots, sectors: int, clutter: Clutter) -> Look:
         info = sensor.info
+        density = clutter.at(plots, 1.0 / sectors)
         return Look(
             sensor=index,
             t_s=float(plots["t_s"].max()),
@@ -213,24 +243,30 @@ class FusionEngine:
             period_s=info.period_s,
             p_detect=info.p_detect,
             whole=sectors == 1,
-            margin_s=_JUDGED_SECTORS_LATE * info.period_s / sectors,
+            margin_s=_JUDGED_SECTORS_LATE * info.period_s / sectors + self.settings.lateness_s,
             lately_s=np.inf if info.kind == "radar" else _SEEN_LATELY_PERIODS * info.period_s,
             clutter_density=density,
-            reference_density=info.clutter_density or density,
+            reference_density=info.clutter_density or clutter.whole(len(plots), 1.0 / sectors),
         )
 
     def _name(self, rows: IntArray) -> None:
         """Give newly confirmed system tracks their public numbers: those of lost tracks that they continue, or new."""
         taken, numbers, dropped = self._stitching.take_over(rows, self._time.now_s)
-        self._picture.name(rows[~np.isin(rows, taken)])
         self._system.life.link[taken] = numbers
         for row in dropped.tolist():
             self._system.drop(row)
+        if self.inputs is not None and len(rows) and self.inputs.shown:
+            # What stands in the picture as a foreign track has an id already.
+            self.inputs.cycle(self._time.now_s, regular=False)
+        self._picture.name(rows[self._system.life.link[rows] < 0])
         self.counters["confirmed"] += len(rows) - len(taken)
         self.counters["stitched"] += len(taken)
 
     def _note_lost(self, ended: list[tuple[int, int, int]]) -> None:
         """Rows had no plot for too long; and tell of those of earlier whose time is over."""
+        if self.inputs is not None and ended:
+            self.inputs.expire(self._time.to_ns(self._time.now_s))
+            ended = self.inputs.heirs_of(ended)
         if ended:
             rows = np.array([row for row, _, _ in ended], np.int64)
             self._stitching.lose(rows, self._picture.last_words(rows))
@@ -247,6 +283,8 @@ class FusionEngine:
         self._registration_due = self.settings.registration
         for change in self._cycle.run(list(self.sensors), self._time.now_s):
             self._correct(change)
+        if self.inputs is not None:
+            self.inputs.cycle(self._time.now_s)
 
     def _correct(self, change: Change) -> None:
         """Plots of a sensor are corrected otherwise from now on: move what the system tracks remember of it along."""
@@ -255,7 +293,8 @@ class FusionEngine:
             self._restart()
         else:
             index = self.sensors[change.sensor_id].index
-            self._system.filters.move_plots(index, lambda z: moved(change, z))
+            later_s = float(change.before[2] - change.after[2])
+            self._system.filters.move_plots(index, lambda z: moved(change, z), -later_s)
 
     def _restart(self) -> None:
         """Make the picture anew from the local tracks: the tracks so far were of plots that did not fit each other."""
@@ -280,7 +319,16 @@ class FusionEngine:
         if self._time.epoch_ns is None or self._time.now_s - self._frame_s < period_s:
             return None
         self._frame_s = self._time.now_s
+        if self.inputs is not None:
+            self.inputs.expire(self._time.to_ns(self._time.now_s))
         return self._picture.next_frame()
+
+    def _settle(self, origin: Geodetic | None) -> None:
+        """The first place that anybody tells of is the origin of the system plane, unless one was given."""
+        if self.origin is None and origin is not None:
+            self._picture.origin = origin
+            for known in self.sensors.values():
+                known.settle(origin)
 
     def _rules(self, period_s: float, coast_s: float) -> Rules:
         s = self.settings

@@ -46,7 +46,7 @@ class TrackFilters(Protocol):
     def estimates(self, mixture: Mixture) -> tuple[FloatArray, FloatArray]: ...  # noqa: D102
     def refined(self, rows: IntArray, lag: int) -> tuple[Mixture, FloatArray]: ...  # noqa: D102
     def remembered(self, row: int) -> Plots: ...  # noqa: D102
-    def move_plots(self, sensor: int, move: Move) -> None: ...  # noqa: D102
+    def move_plots(self, sensor: int, move: Move, later_s: float) -> None: ...  # noqa: D102
     def grow(self, rows: int) -> None: ...  # noqa: D102
 
 
@@ -61,7 +61,7 @@ class Look(NamedTuple):
         margin_s: how long after its period a sector look is judged.
         lately_s: a sensor without coverage counts misses only where it saw the track within this time; infinite for a
             radar, whose coverage is its range.
-        clutter_density: false plots a look and square metre, as estimated now.
+        clutter_density: (m,) false plots a look and square metre where each plot is, as estimated now.
         reference_density: the density that the log-likelihood of the picture is measured against.
     """
 
@@ -74,7 +74,7 @@ class Look(NamedTuple):
     whole: bool
     margin_s: float
     lately_s: float
-    clutter_density: float
+    clutter_density: FloatArray
     reference_density: float
 
 
@@ -197,7 +197,7 @@ class Layer:
         by_confirmed = (row >= 0) & self.life.confirmed[row]
         gain = np.log(look.p_detect / (2.0 * np.pi * look.clutter_density)) - 0.5 * cost
         lives.hit(self.life, self.rules, row, fed, plots, gain, look.sensor)
-        gained = gain[fed].sum() + fed.sum() * np.log(look.clutter_density / look.reference_density)
+        gained = (gain + np.log(look.clutter_density / look.reference_density))[fed].sum()
         return row, by_confirmed, int((row >= 0).sum() - fed.sum()), float(gained)
 
     def _start(self, plots: Plots, look: Look, row: IntArray) -> None:

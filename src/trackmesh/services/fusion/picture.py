@@ -10,6 +10,9 @@ import numpy.typing as npt
 
 from trackmesh.protocol.messages import ENDED, Geodetic, RefinedFrame, TrackFrame
 from trackmesh.services.fusion import frames
+from trackmesh.services.fusion.composition import Composition
+from trackmesh.services.fusion.foreign import Rows as ForeignRows
+from trackmesh.services.fusion.inputs import system_numbers
 from trackmesh.services.fusion.layer import Layer
 from trackmesh.services.fusion.sensors import Sensor
 from trackmesh.services.fusion.settings import EngineSettings
@@ -42,6 +45,7 @@ class Picture:
 
     Attributes:
         origin: of the system plane.
+        composition: what other units' tracks add; None where there are no inputs.
         next_track: the number of the next confirmed track, 0 before the first data.
         seq: number of the next frame.
     """
@@ -59,22 +63,31 @@ class Picture:
         self._ended: list[TrackFrame] = []
         self._refined_s = np.empty(0)
         self.origin: Geodetic | None = None
+        self.composition: Composition | None = None
         self.next_track = unit.first_track
         self.seq = 0
 
     def name(self, rows: IntArray) -> None:
         """Give newly confirmed rows their public numbers."""
-        if not len(rows):
-            return
+        if len(rows):
+            self._system.life.link[rows] = self.numbers(len(rows))
+
+    def numbers(self, n: int) -> IntArray:
+        """Public numbers (n,) never used before."""
         if not self.next_track and self._time.epoch_ns is not None:
             self.next_track = max(1, self._time.epoch_ns // 1_000_000 - TRACK_EPOCH_MS)
-        self._system.life.link[rows] = (self._unit.number << _TRACK_BITS) | (self.next_track + np.arange(len(rows)))
-        self.next_track += len(rows)
+        self.next_track += n
+        return (self._unit.number << _TRACK_BITS) | (self.next_track - n + np.arange(n))
 
     def last_words(self, rows: IntArray) -> TrackFrame:
         """What is to be told of rows that end now."""
         frame = self._frame_of(rows, self._time.now_s, self.seq)
         return frame.model_copy(update={"status": np.full(len(rows), ENDED, np.uint8)})
+
+    def foreign_last_words(self, unit_id: str, rows: ForeignRows) -> TrackFrame:
+        """The same of tracks of another unit that stood in the picture."""
+        assert self.composition is not None
+        return self.composition.last_words(self._blank(self._time.now_s), unit_id, rows, self._time.now_s)
 
     def tell(self, words: list[TrackFrame]) -> None:
         """Put last words into the next frame."""
@@ -95,14 +108,22 @@ class Picture:
         if not tentative:
             rows = rows[self._system.life.confirmed[rows]]
         rows = rows[self._system.filters.oldest_s[rows] <= t_s]
-        return self._frame_of(rows, t_s, self.seq)
+        frame = self._frame_of(rows, t_s, self.seq)
+        if self.composition is None:
+            return frame
+        return frames.join(frame, self.composition.alone(self._blank(t_s), t_s))
+
+    def _blank(self, t_s: float) -> TrackFrame:
+        return self._frame_of(np.empty(0, np.int64), t_s, self.seq)
 
     def _frame_of(self, rows: IntArray, t_s: float, seq: int) -> TrackFrame:
         known = self._system.life
         x, P, mu = self._system.predict(rows, t_s)
+        if self.composition is not None:
+            x, P = self.composition.fuse(system_numbers(known.uid[rows]), x, P, t_s)
         state, covariance = frames.pack_states(x, P)
         longest = max((s.info.period_s for s in self._sensors.values()), default=1.0)
-        return TrackFrame.model_construct(
+        frame = TrackFrame.model_construct(
             schema_version=1,
             unit_id=self._unit.unit_id,
             boot_id=self._unit.boot_id,
@@ -124,6 +145,9 @@ class Picture:
             updated_t_ns=self._time.to_ns_array(known.last_s[rows]),
             first_t_ns=self._time.to_ns_array(known.first_s[rows]),
         )
+        if self.composition is None:
+            return frame
+        return self.composition.complete(frame, system_numbers(known.uid[rows]), t_s)
 
     def refined(self) -> RefinedFrame | None:
         """States of ``settings.lag`` plots ago, refined by those since, of the tracks that moved on since then.

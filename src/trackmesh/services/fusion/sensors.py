@@ -9,37 +9,11 @@ import pymap3d
 from trackmesh.protocol.errors import RefusedMessage
 from trackmesh.protocol.messages import Geodetic, PlotBatch, SensorInfo
 from trackmesh.services.estimation.convert import polar_to_plane
-from trackmesh.services.estimation.plots import Plots, make_plots
+from trackmesh.services.estimation.plots import Plots, empty_plots, make_plots
+from trackmesh.services.fusion.clutter import Clutter
+from trackmesh.services.fusion.plane import place
 
 FloatArray = npt.NDArray[np.float64]
-
-_LOOKS_REMEMBERED = 5.0
-
-
-class ClutterDensity:
-    """False plots a look and square metre: an exponential mean over the last looks.
-
-    Counted are the plots that no confirmed track took; at a cold start these are all, so that nothing is confirmed too
-    easily.
-    """
-
-    def __init__(self, area_m2: float, declared: float | None) -> None:
-        self._area_m2 = area_m2
-        self._floor = 0.5 / area_m2
-        self._plots = (declared or 0.0) * area_m2
-        self._area_seen_m2 = area_m2 if declared else 0.0
-
-    def add(self, plots: int, share_of_look: float) -> None:
-        """Count the unexplained plots of a batch that was this share of a whole look."""
-        keep = np.exp(-share_of_look / _LOOKS_REMEMBERED)
-        self._plots = self._plots * keep + plots
-        self._area_seen_m2 = self._area_seen_m2 * keep + share_of_look * self._area_m2
-
-    def value(self, plots_now: int, share_of_look: float) -> float:
-        """The present estimate, 1/m^2; before any batch was counted, that of the batch at hand."""
-        if self._area_seen_m2 == 0.0:
-            return max(plots_now / (share_of_look * self._area_m2), self._floor)
-        return max(self._plots / self._area_seen_m2, self._floor)
 
 
 class Sensor:
@@ -49,15 +23,16 @@ class Sensor:
         index: its number within the engine.
         info: what it says of itself.
         site: (2,) east and north of it in the system plane.
+        local_clutter, system_clutter: false plots, as its local tracks and the system tracks leave them.
     """
 
-    def __init__(self, index: int, info: SensorInfo, origin: Geodetic | None) -> None:
+    def __init__(self, index: int, info: SensorInfo, origin: Geodetic | None, *, clutter_areas: bool = False) -> None:
         self.index = index
         self.info = info
         self.settle(origin)
-        area = np.pi * info.max_range_m**2
-        self.local_clutter = ClutterDensity(area, info.clutter_density)
-        self.system_clutter = ClutterDensity(area, info.clutter_density)
+        site = self.site if info.kind == "radar" else None
+        self.local_clutter = Clutter(site, info.max_range_m, info.clutter_density, clutter_areas)
+        self.system_clutter = Clutter(site, info.max_range_m, info.clutter_density, clutter_areas)
 
     def settle(self, origin: Geodetic | None) -> None:
         """Place the sensor in the plane of this origin, which may be known only after the sensor."""
@@ -82,6 +57,12 @@ class Sensor:
             if "elevation_rad" in batch.columns:
                 plots["level"] = np.cos(batch.values[:, batch.columns.index("elevation_rad")])
         return plots
+
+    def saw_nothing(self, share_of_look: float) -> None:
+        """A batch without plots, that was this share of a whole look, came."""
+        nothing = empty_plots((0,))
+        for clutter in (self.local_clutter, self.system_clutter):
+            clutter.add(nothing, np.zeros(0, np.bool_), share_of_look)
 
     def _range_rate_variance(self, batch: PlotBatch, column: int) -> FloatArray | float:
         if batch.variances is not None:
@@ -147,23 +128,4 @@ def _place(info: SensorInfo, origin: Geodetic | None) -> tuple[FloatArray, Float
         return np.array(info.site_enu_m[:2], float), None
     if info.site is None or origin is None:
         return np.zeros(2), None
-    s, o = info.site, origin
-    east, north, _ = pymap3d.geodetic2enu(
-        s.latitude_deg, s.longitude_deg, s.height_m, o.latitude_deg, o.longitude_deg, o.height_m
-    )
-    turn = np.empty((2, 3))
-    for k, step in enumerate(np.eye(3).tolist()):
-        u, v, w = pymap3d.enu2uvw(*step, s.latitude_deg, s.longitude_deg)
-        east_k, north_k, _ = _uvw2enu(float(u), float(v), float(w), o)
-        turn[:, k] = east_k, north_k
-    return np.array([float(east), float(north)]), turn
-
-
-def _uvw2enu(u: float, v: float, w: float, o: Geodetic) -> tuple[float, float, float]:
-    lat, lon = np.deg2rad(o.latitude_deg), np.deg2rad(o.longitude_deg)
-    along = np.cos(lon) * u + np.sin(lon) * v
-    return (
-        float(-np.sin(lon) * u + np.cos(lon) * v),
-        float(-np.sin(lat) * along + np.cos(lat) * w),
-        float(np.cos(lat) * along + np.sin(lat) * w),
-    )
+    return place(info.site, origin)

@@ -287,7 +287,7 @@ class FusionService:
             refused=stream.refused,
             last_seq=max(stream.seq, 0),
             last_t_ns=stream.last_t_ns,
-            clutter_density=sensor.system_clutter.value(0, 1.0) if sensor else None,
+            clutter_density=sensor.system_clutter.whole() if sensor else None,
         )
 
 

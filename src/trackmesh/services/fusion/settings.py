@@ -16,6 +16,7 @@ from trackmesh.services.estimation.filters import FilterName, generic_models, ma
 from trackmesh.services.estimation.imm_tracks import ImmTracks
 from trackmesh.services.estimation.pairs import PairRules
 from trackmesh.services.fusion.biases import RegistrationRules
+from trackmesh.services.fusion.inputs import InputRules
 from trackmesh.services.fusion.layer import TrackFilters
 from trackmesh.services.fusion.pair_tests import PairTest, TestName, make_test
 from trackmesh.services.runtime import ServiceSettings
@@ -56,7 +57,7 @@ class EngineSettings(BaseModel):
     drop_score: Annotated[float, Field(lt=0)] = -2.0
     drop_fall: Positive = 6.0
     end_fall: Positive = Field(
-        9.0, description="a confirmed track ends when its score is so far below its best: it lives on clutter"
+        12.0, description="a confirmed track ends when its score is so far below its best: it lives on clutter"
     )
     max_misses: Annotated[int, Field(ge=1)] = 3
     coast_s: Positive = Field(15.0, description="a confirmed track ends after this time without a plot")
@@ -69,6 +70,10 @@ class EngineSettings(BaseModel):
         32, description="plots a system track keeps, of which the younger half can always be replayed"
     )
     ring_local: Annotated[int, Field(ge=2, le=512)] = 16
+    lateness_s: NonNegative = Field(
+        0.0, description="plots usually come no later than this: a sector without a plot is judged so much later"
+    )
+    clutter_areas: bool = Field(True, description="estimate false plots area by area, not only over all")
     max_lateness_s: Positive = Field(10.0, description="plots older than this are dropped and counted")
     cycle_s: Positive = Field(2.0, description="association cycle")
     association: TestName = Field("seqllr", description="the test of whether local tracks are of one target")
@@ -84,9 +89,24 @@ class EngineSettings(BaseModel):
     bias_range_m: NonNegative = Field(300.0, description="range bias expected of a radar, one sigma; 0: none")
     bias_azimuth_deg: NonNegative = Field(0.6, description="azimuth bias expected of a radar, one sigma")
     bias_position_m: NonNegative = Field(100.0, description="bias expected of a position sensor, one sigma per axis")
+    bias_time_s: NonNegative = Field(
+        0.0, description="time offset expected of a sensor's clock, one sigma; 0: clocks are right"
+    )
+    right_clocks: list[str] = Field(
+        [], description="sensors whose clocks are right; without one, of time offsets only differences can be known"
+    )
+    one_mast: bool = Field(
+        False, description="the sensors stand together: correct also where only their difference can be known"
+    )
     lock_m: Positive = Field(100.0, description="plots are corrected once the shift at 50 km is known so well")
     restart_shift_m: Positive = Field(
         500.0, description="a first correction larger than this at 50 km makes the picture anew from local tracks"
+    )
+    input_q_m2ps3: Positive = Field(
+        100.0, description="acceleration noise under which the tracks of other units are predicted"
+    )
+    input_error_m: NonNegative = Field(
+        0.0, description="error of other units' positions that their covariances do not know, one sigma per axis"
     )
     frame_period_s: NonNegative = Field(0.0, description="least time between frames; 0: one after every batch")
     idle_frame_s: Positive = Field(1.0, description="time between frames while no data comes")
@@ -115,12 +135,18 @@ class EngineSettings(BaseModel):
             rules = rules._replace(nu=np.inf)
         return make_test(self.association, rules, self.association_alpha)
 
+    def input_rules(self) -> InputRules:
+        """What to expect of other units."""
+        return InputRules(self.coast_s, self.stitch_s, self.input_q_m2ps3, self.input_error_m, self.pair_test)
+
     def registration_rules(self) -> RegistrationRules:
         """What to expect of biases."""
         return RegistrationRules(
             prior_range_m=self.bias_range_m,
             prior_azimuth_rad=float(np.deg2rad(self.bias_azimuth_deg)),
             prior_position_m=self.bias_position_m,
+            prior_time_offset_s=self.bias_time_s,
+            lock_difference=self.one_mast,
             lock_m=self.lock_m,
         )
 

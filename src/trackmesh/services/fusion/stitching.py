@@ -113,7 +113,7 @@ class Stitching:
         life = self._system.life
         rows = self._system.rows
         rows = rows[life.confirmed[rows] & (life.last_s[rows] < life.first_s[new].max())]
-        return rows[~np.isin(rows, new)]
+        return np.asarray(rows[~np.isin(rows, new)])
 
     def _fitting(
         self, old: tuple[FloatArray, FloatArray], old_t_s: FloatArray, new: IntArray, now_s: float
@@ -122,7 +122,7 @@ class Stitching:
         x, P = old
         new_x, new_P, _ = self._system.predict(new, np.maximum(self._system.filters.t_s[new], now_s))
         i, j = (grid.ravel() for grid in np.meshgrid(np.arange(len(x)), np.arange(len(new)), indexing="ij"))
-        before = np.asarray(old_t_s[i] < self._system.life.first_s[new[j]])
+        before = old_t_s[i] < self._system.life.first_s[new[j]]
         i, j = i[before], j[before]
         distance, _ = state_distances(x, P, new_x, new_P, i, j, np.zeros((len(i), 2, 2)))
         fits = distance < _GATE

@@ -252,7 +252,7 @@ def measured_clutter(records: list[Message], settings: EngineSettings) -> dict[s
     seen: dict[str, list[float]] = {}
     for _ in run.frames(records):
         for name, sensor in (run.engine.sensors if run.engine else {}).items():
-            seen.setdefault(name, []).append(sensor.system_clutter.value(0, 1.0))
+            seen.setdefault(name, []).append(sensor.system_clutter.whole())
     return {name: float(np.median(values)) for name, values in seen.items()}
 
 
