@@ -1,8 +1,8 @@
 """The JSON-lines files: one object a line, ``"type"`` first, then the fields of the message.
 
-``PLOTS.jsonl`` holds ``unit``, ``origin``, ``sensor``, ``plots`` and ``tick`` in order of arrival; ``TRACKS.jsonl``
-holds ``tracks``; ``TRUTH.jsonl`` holds ``truth``; ``SCANS.jsonl`` holds ``emi_scan``; results of an inversion are
-``emi_result``.
+``PLOTS.jsonl`` holds ``unit``, ``origin``, ``sensor``, ``plots`` and ``tick`` in order of arrival; ``RANGES.jsonl``
+likewise, with ``ranges`` for plots, and ``gone``; ``TRACKS.jsonl`` holds ``tracks``, ``TAGS.jsonl`` ``tags``;
+``TRUTH.jsonl`` holds ``truth``; ``SCANS.jsonl`` holds ``emi_scan``; results of an inversion are ``emi_result``.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ from trackmesh.protocol.messages import (
     Geodetic,
     Message,
     PlotBatch,
+    RangeBatch,
     RefinedFrame,
     SensorInfo,
+    TagFrame,
     TrackFrame,
     TruthFrame,
 )
@@ -36,6 +38,12 @@ class Tick(Message):
     """Time passed without data (a line of a black box)."""
 
     t_ns: UnixNs
+
+
+class Gone(Message):
+    """A sensor that is there no longer (a line of a black box)."""
+
+    sensor_id: Id
 
 
 class RegistrationRecord(Message):
@@ -54,6 +62,7 @@ class UnitRecord(Message):
     first_track_number: Annotated[int, Field(ge=0, lt=2**41)]
     settings: dict[str, Any]
     registration: RegistrationRecord | None = None
+    state: str | None = None
 
 
 Record = Message
@@ -63,8 +72,11 @@ RECORD_TYPES: dict[str, type[Message]] = {
     "origin": Geodetic,
     "sensor": SensorInfo,
     "plots": PlotBatch,
+    "ranges": RangeBatch,
+    "gone": Gone,
     "tick": Tick,
     "tracks": TrackFrame,
+    "tags": TagFrame,
     "refined": RefinedFrame,
     "truth": TruthFrame,
     "emi_scan": EmiScanBatch,

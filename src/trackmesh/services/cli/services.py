@@ -35,7 +35,8 @@ StartNs = Annotated[
 sim = typer.Typer(help="Simulated sensors: live, or as a recording.", no_args_is_help=True)
 
 
-def _given(**flags: object) -> dict[str, Any]:
+def given(**flags: object) -> dict[str, Any]:
+    """The flags that were given."""
     return {name: value for name, value in flags.items() if value is not None}
 
 
@@ -58,7 +59,7 @@ def router(
     """Run a Zenoh router, where there is no zenohd."""
     from trackmesh.services.router import serve
 
-    settings = ServiceSettings.load(None, _given(log_level=log_level, log_format=log_format))
+    settings = ServiceSettings.load(None, given(log_level=log_level, log_format=log_format))
     raise typer.Exit(serve(listen.split(",") if listen else [], config, settings.log_level, settings.log_format))
 
 
@@ -80,6 +81,10 @@ def fusion(
         Path | None,
         typer.Option("--black-box", metavar="FILE", help="Record the engine's inputs, for trackmesh track."),
     ] = None,
+    state_file: Annotated[
+        Path | None,
+        typer.Option("--state-file", metavar="FILE", help="Keep the tracks and their numbers here over restarts."),
+    ] = None,
     registration_file: Annotated[
         Path | None,
         typer.Option("--registration-file", metavar="FILE", help="Keep the sensors' biases here over restarts."),
@@ -91,9 +96,9 @@ def fusion(
     from trackmesh.services.fusion.service import run
     from trackmesh.services.fusion.settings import FusionSettings
 
-    flags = _given(
+    flags = given(
         connect=connect, realm=realm, unit_id=unit_id, unit_number=unit_number, clock=clock, black_box=black_box,
-        registration_file=registration_file,
+        registration_file=registration_file, state_file=state_file,
         log_level=log_level, log_format=log_format,
     )  # fmt: skip
     raise typer.Exit(run(FusionSettings.load(config, flags)))
@@ -115,13 +120,14 @@ def emi(
     from trackmesh.services.emi.service import main
     from trackmesh.services.emi.settings import EmiSettings
 
-    flags = _given(
+    flags = given(
         connect=connect, realm=realm, unit_id=unit_id, workers=workers, log_level=log_level, log_format=log_format
     )
     raise typer.Exit(main(EmiSettings.load(config, flags)))
 
 
-def _run_simulator(kind: str, ident: str, flags: dict[str, Any], config: Path | None, work: Any) -> None:
+def run_simulator(kind: str, ident: str, flags: dict[str, Any], config: Path | None, work: Any) -> None:
+    """Be a simulated sensor: ``work(runtime)`` until told to stop."""
     settings = ServiceSettings.load(config, flags | {"unit_id": ident})
 
     def start(runtime: ServiceRuntime) -> None:
@@ -155,6 +161,7 @@ def sim_radar(
     from trackmesh.sim.scenario import load_scenario
 
     world = load_scenario(scenario)
+    world.seen_targets()
     radar_id = world.radar(radar).id if radar else world.radars[0].id
     begin_ns = time.time_ns() if start_ns is None else start_ns
 
@@ -163,8 +170,8 @@ def sim_radar(
             runtime.bus, world, radar_id, seed, begin_ns, runtime.stopping, keys=runtime.keys, boot_id=runtime.boot_id
         )
 
-    flags = _given(connect=connect, realm=realm, log_level=log_level, log_format=log_format)
-    _run_simulator("sim-radar", radar_id, flags, config, work)
+    flags = given(connect=connect, realm=realm, log_level=log_level, log_format=log_format)
+    run_simulator("sim-radar", radar_id, flags, config, work)
 
 
 @sim.command("truth")
@@ -188,8 +195,8 @@ def sim_truth(
     def work(runtime: ServiceRuntime) -> None:
         run_truth(runtime.bus, world, seed, begin_ns, runtime.stopping, keys=runtime.keys)
 
-    flags = _given(connect=connect, realm=realm, log_level=log_level, log_format=log_format)
-    _run_simulator("sim-truth", world.name, flags, config, work)
+    flags = given(connect=connect, realm=realm, log_level=log_level, log_format=log_format)
+    run_simulator("sim-truth", world.name, flags, config, work)
 
 
 @sim.command("record")

@@ -8,7 +8,7 @@ plot. Plots must come in order of time: a late one is refused.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -224,6 +224,10 @@ class AlphaBetaTracks:
             NotImplementedError: always; settings that ask for it are refused.
         """
         raise NotImplementedError
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """All that rows hold, by name, row by row: to be read and, in rows, to be written."""
+        return self._rows._asdict()
 
     def grow(self, rows: int) -> None:
         """Add empty rows."""

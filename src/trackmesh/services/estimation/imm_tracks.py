@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,8 @@ from trackmesh.services.estimation.plots import Plots
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
+
+_SHARED = ("models", "work", "scratch")
 
 
 def strength(models: Models) -> Strength:
@@ -121,6 +124,10 @@ class ImmTracks:
         out = make_mixture(len(rows), len(self.models.kind))
         t_s = tracks.refined(self.filters, rows, lag, out)
         return out, t_s
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """All that rows hold, by name, row by row: to be read and, in rows, to be written."""
+        return {name: getattr(self.filters, name) for name in self.filters._fields if name not in _SHARED}
 
     def grow(self, rows: int) -> None:
         """Add empty rows."""

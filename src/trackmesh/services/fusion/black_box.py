@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from pathlib import Path
 
 from trackmesh.protocol.files import RecordWriter, RegistrationRecord, Tick, UnitRecord
@@ -10,7 +11,9 @@ from trackmesh.services.fusion.engine import Unit
 from trackmesh.services.fusion.settings import EngineSettings
 
 
-def unit_record(unit: Unit, settings: EngineSettings, registration: RegistrationRecord | None = None) -> UnitRecord:
+def unit_record(
+    unit: Unit, settings: EngineSettings, registration: RegistrationRecord | None = None, state: bytes | None = None
+) -> UnitRecord:
     """The first line of a black box."""
     return UnitRecord(
         unit_id=unit.unit_id,
@@ -19,6 +22,7 @@ def unit_record(unit: Unit, settings: EngineSettings, registration: Registration
         first_track_number=unit.first_track,
         settings=settings.model_dump(mode="json"),
         registration=registration,
+        state=base64.b64encode(state).decode() if state is not None else None,
     )
 
 
@@ -36,9 +40,10 @@ class BlackBox:
         settings: EngineSettings,
         origin: Geodetic | None,
         registration: RegistrationRecord | None = None,
+        state: bytes | None = None,
     ) -> None:
         self._writer = RecordWriter(path)
-        self._writer.write(unit_record(unit, settings, registration))
+        self._writer.write(unit_record(unit, settings, registration, state))
         if origin is not None:
             self._writer.write(origin)
 

@@ -69,6 +69,15 @@ class Clutter:
             return np.full(len(plots), whole)
         return _densities(self._cells, self._covered_m2, self._looks, whole, self._corner, self._cell_m, plots)
 
+    def kept(self) -> dict[str, npt.NDArray[np.float64]]:
+        """What is to be known after a restart."""
+        return {"whole": np.array([self._plots, self._area_seen_m2, self._looks]), "cells": self._cells.copy()}
+
+    def restore(self, arrays: dict[str, npt.NDArray[np.float64]]) -> None:
+        """Go on with what ``kept`` gave."""
+        self._plots, self._area_seen_m2, self._looks = arrays["whole"].tolist()
+        self._cells[:] = arrays["cells"]
+
 
 def _covered(cells: int) -> FloatArray:
     """Share of each cell that a circle through the middles of the sides covers, (cells, cells)."""

@@ -38,6 +38,11 @@ class Corrections:
                 prior[2] = 0.0
             self.biases.announce(info.sensor_id, kind, site_m, prior)
 
+    def announce_reference(self, name: str, error_m: float) -> None:
+        """Take note of a unit whose positions are right but for this error, one sigma per axis."""
+        if self.biases is not None:
+            self.biases.announce(name, "position", prior=(error_m, error_m, 0.0))
+
     def correct(self, plots: Plots) -> Plots:
         """Plots of one or more sensors, each corrected by what is applied to its sensor."""
         if self.biases is None or not any(self.biases.locked(sensor_id) for sensor_id in self._ids):

@@ -8,7 +8,7 @@ whose plots fit.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -42,6 +42,13 @@ class Declared(NamedTuple):
     row_b: IntArray
 
 
+class Reference(NamedTuple):
+    """Tracks of a unit whose positions are taken to be right."""
+
+    name: str
+    tracks: LocalTracks
+
+
 class AssociationCycle:
     """The tests between all pairs of sensors, by their indices; ``locals_`` grows with the sensors.
 
@@ -65,10 +72,14 @@ class AssociationCycle:
         self._counters = counters
         self._end = end
         self._tests: dict[tuple[int, int], PairTest] = {}
+        self._reference_tests: dict[tuple[str, str], PairTest] = {}
         self.declared: list[Declared] = []
 
-    def run(self, sensors: list[str], now_s: float) -> list[Change]:
-        """One cycle at a time; what changed in the corrections that are applied to plots."""
+    def run(self, sensors: list[str], now_s: float, references: Sequence[Reference] = ()) -> list[Change]:
+        """One cycle at a time; what changed in the corrections that are applied to plots.
+
+        ``references`` are no sensors of ours, but known to the registration: it learns from their tracks as well.
+        """
         for sensor, local in enumerate(self._locals):
             # The tracks of a sensor that fell silent end here: it steps no more.
             local.judge(now_s)
@@ -87,6 +98,11 @@ class AssociationCycle:
                 if found is not None:
                     self.declared.append(Declared(a, b, seen[a].row[found.a], seen[b].row[found.b]))
                 self._join(a, b, seen[a].number[pairs.a], seen[b].number[pairs.b], now_s)
+        for one in references:
+            for a, name in enumerate(sensors):
+                test = self._reference_tests.setdefault((name, one.name), self._new_test())
+                pairs = test.cycle(seen[a], one.tracks, now_s, self._blur(name, one.name))
+                self._teach(name, one.name, seen[a], one.tracks, pairs, now_s)
         return self._registration.settle(now_s) if self._registration else []
 
     def _local_tracks(self, local: Layer, sensor_id: str, now_s: float) -> LocalTracks:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from trackmesh.protocol.errors import RefusedMessage
+from trackmesh.protocol.errors import RefusedMessage, TrackmeshError
 from trackmesh.protocol.messages import (
     Geodetic,
     PlotBatch,
@@ -29,7 +29,7 @@ from trackmesh.services.fusion.biases import Change, moved
 from trackmesh.services.fusion.clutter import Clutter
 from trackmesh.services.fusion.composition import Composition
 from trackmesh.services.fusion.corrections import Corrections
-from trackmesh.services.fusion.cycle import AssociationCycle
+from trackmesh.services.fusion.cycle import AssociationCycle, Reference
 from trackmesh.services.fusion.inputs import Inputs
 from trackmesh.services.fusion.layer import Layer, Look
 from trackmesh.services.fusion.life import Rules
@@ -37,6 +37,7 @@ from trackmesh.services.fusion.picture import Picture, Unit
 from trackmesh.services.fusion.restart import picture_of
 from trackmesh.services.fusion.sensors import Sensor
 from trackmesh.services.fusion.settings import EngineSettings
+from trackmesh.services.fusion.snapshot import Snapshot, named, under
 from trackmesh.services.fusion.stitching import Stitching
 from trackmesh.services.fusion.timeline import Timeline
 
@@ -192,6 +193,58 @@ class FusionEngine:
             self.unit.unit_id, self.unit.boot_id, self._picture.seq, self._time.to_ns(self._time.now_s)
         )
 
+    def snapshot(self) -> Snapshot | None:
+        """What is needed to go on after a restart; None before any data."""
+        now_ns = self._time.now_ns
+        if now_ns is None:
+            return None
+        arrays = named("system", self._system.kept()) | named("lost", self._stitching.kept())
+        for sensor, local in zip(self.sensors.values(), self._locals, strict=True):
+            arrays |= named(f"local/{sensor.index}", local.kept())
+            arrays |= named(f"clutter/{sensor.index}/local", sensor.local_clutter.kept())
+            arrays |= named(f"clutter/{sensor.index}/system", sensor.system_clutter.kept())
+        numbers = {"epoch_ns": self._time.epoch_ns, "next_track": self._picture.next_track}
+        return Snapshot(
+            t_ns=now_ns,
+            settings=self.settings.model_dump(mode="json"),
+            numbers=numbers,
+            origin=self.origin,
+            sensors=[sensor.info for sensor in self.sensors.values()],
+            registration=self.corrections.record(now_ns),
+            streams={},
+            arrays=arrays,
+        )
+
+    def restore(self, kept: Snapshot) -> None:
+        """Go on from what an earlier run knew, before anything else is told.
+
+        Raises:
+            TrackmeshError: it is of other settings; the engine is then of no use.
+        """
+        if kept.settings != self.settings.model_dump(mode="json"):
+            raise TrackmeshError("The state was made with other settings.")
+        try:
+            self._restore(kept)
+        except (KeyError, ValueError, TypeError):
+            raise TrackmeshError("The state is not that of a unit with these settings.") from None
+
+    def _restore(self, kept: Snapshot) -> None:
+        self._time.epoch_ns = int(kept.numbers["epoch_ns"])
+        self._time.advance(self._time.to_s(kept.t_ns))
+        self._picture.next_track = max(int(kept.numbers["next_track"]), self.unit.first_track)
+        self._picture.origin = kept.origin
+        if kept.registration is not None:
+            self.corrections.restore(kept.registration, kept.t_ns)
+        for info in kept.sensors:
+            self.sensor(info)
+        self._system.restore(under("system", kept.arrays))
+        self._stitching.restore(under("lost", kept.arrays))
+        for sensor, local in zip(self.sensors.values(), self._locals, strict=True):
+            local.restore(under(f"local/{sensor.index}", kept.arrays))
+            sensor.local_clutter.restore(under(f"clutter/{sensor.index}/local", kept.arrays))
+            sensor.system_clutter.restore(under(f"clutter/{sensor.index}/system", kept.arrays))
+        self.counters["restored"] = int(self._system.life.confirmed[self._system.rows].sum())
+
     def figures(self) -> dict[str, float]:
         """Present values for the status: tracks, local tracks, pairs under the sequential test."""
         rows = self._system.rows
@@ -281,10 +334,18 @@ class FusionEngine:
             return
         self._cycle_s = self._time.now_s
         self._registration_due = self.settings.registration
-        for change in self._cycle.run(list(self.sensors), self._time.now_s):
+        for change in self._cycle.run(list(self.sensors), self._time.now_s, self._references()):
             self._correct(change)
         if self.inputs is not None:
             self.inputs.cycle(self._time.now_s)
+
+    def _references(self) -> list[Reference]:
+        if self.inputs is None or not self.settings.input_reference or self.corrections.biases is None:
+            return []
+        found = self.inputs.references(self._time.now_s)
+        for one in found:
+            self.corrections.announce_reference(one.name, self.settings.input_error_m)
+        return found
 
     def _correct(self, change: Change) -> None:
         """Plots of a sensor are corrected otherwise from now on: move what the system tracks remember of it along."""

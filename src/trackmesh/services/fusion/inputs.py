@@ -22,6 +22,7 @@ from trackmesh.protocol.errors import RefusedMessage
 from trackmesh.protocol.messages import Geodetic, TrackFrame
 from trackmesh.services.fusion.absent import Absent
 from trackmesh.services.fusion.association import DeclaredPairs, LocalTracks
+from trackmesh.services.fusion.cycle import Reference
 from trackmesh.services.fusion.foreign import NOBODY, ForeignTracks, Rows
 from trackmesh.services.fusion.foreign_frames import Told, moved, read
 from trackmesh.services.fusion.layer import Layer
@@ -110,6 +111,7 @@ class Inputs:
         self._tests = [rules.new_test() for _ in units]
         self._absent = Absent(rules.wait_s)
         self._next = 0
+        self._rings: set[str] = set()
 
     @property
     def shown(self) -> bool:
@@ -143,6 +145,8 @@ class Inputs:
             raise RefusedMessage("old_frame", f"A frame of {unit} is older than the one before it.")
         self.streams.check(unit, frame.boot_id, frame.seq, np.full(len(frame.track_id), frame.t_ns), None)
         self.streams.known[unit].last_t_ns = frame.t_ns
+        if self._our_unit.unit_id in frame.sensors and (frame.track_id >> TRACK_BITS >= self._our_unit.number).any():
+            self._rings.add(unit)
         return told
 
     def tell(self, frame: TrackFrame, told: Told, origin: Geodetic | None, t_s: float, now_ns: int) -> None:
@@ -187,6 +191,18 @@ class Inputs:
             else:
                 left.append((row, uid, link))
         return left
+
+    def references(self, now_s: float) -> list[Reference]:
+        """The tracks of each unit, but of two that take each other's only those of the one with the lower number.
+
+        Else both would follow each other.
+        """
+        found = []
+        for unit, bank in self.banks.items():
+            rows = bank.rows.take(~bank.rows.coasting)
+            if unit not in self._rings and len(rows.ident):
+                found.append(Reference(unit, _as_tracks(rows, *rows.at(now_s, self.rules.q_m2ps3))))
+        return found
 
     def _system_entries(self, now_s: float) -> _Entries:
         life = self._system.life

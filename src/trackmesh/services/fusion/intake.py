@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from typing import Any
 
 from trackmesh.protocol.errors import RefusedMessage
 from trackmesh.protocol.messages import PlotBatch
@@ -41,6 +42,15 @@ class Intake:
     def stream(self, sensor_id: str) -> Stream:
         """The stream of a sensor, new if it was never heard of."""
         return self.streams.setdefault(sensor_id, Stream())
+
+    def kept(self) -> dict[str, list[Any]]:
+        """By sensor the boot id, the number and the time of the last batch taken, for the next start."""
+        return {name: [one.boot_id, one.seq, one.last_t_ns] for name, one in self.streams.items() if one.boot_id}
+
+    def restore(self, kept: dict[str, list[Any]]) -> None:
+        """Go on where an earlier run was, so that what it took is not taken again."""
+        for name, (boot_id, seq, last_t_ns) in kept.items():
+            self.streams[name] = Stream(boot_id=boot_id, seq=seq, last_t_ns=last_t_ns)
 
     def check(self, batch: PlotBatch, now_ns: int | None) -> None:
         """Let a batch in, or not; without ``now_ns`` its times are not judged.

@@ -6,7 +6,7 @@ The same code keeps the local tracks of one sensor and the system tracks of all 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ from trackmesh.services.estimation.gating import Mixture
 from trackmesh.services.estimation.plots import Plots
 from trackmesh.services.fusion import life as lives
 from trackmesh.services.fusion.life import Life, Rules, make_life
+from trackmesh.services.fusion.snapshot import Arrays, fill, named, under
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -47,6 +48,7 @@ class TrackFilters(Protocol):
     def refined(self, rows: IntArray, lag: int) -> tuple[Mixture, FloatArray]: ...  # noqa: D102
     def remembered(self, row: int) -> Plots: ...  # noqa: D102
     def move_plots(self, sensor: int, move: Move, later_s: float) -> None: ...  # noqa: D102
+    def arrays(self) -> dict[str, npt.NDArray[Any]]: ...  # noqa: D102
     def grow(self, rows: int) -> None: ...  # noqa: D102
 
 
@@ -178,6 +180,27 @@ class Layer:
         """End one track at once."""
         self.life.alive[row] = False
         self._free.append(row)
+
+    def kept(self) -> Arrays:
+        """All that is to be known of the living tracks after a restart, row by row."""
+        rows = self.rows
+        held = {name: value[rows] for name, value in self.filters.arrays().items()}
+        alive = {name: value[rows] for name, value in self.life._asdict().items()}
+        return named("filters", held) | named("life", alive) | {"next_uid": np.array(self._next_uid)}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Go on with what ``kept`` gave, in a layer without tracks.
+
+        Raises:
+            TrackmeshError: it is of other filters.
+        """
+        held, alive = under("filters", arrays), under("life", arrays)
+        rows = self._take(len(alive.get("uid", ())))
+        for name, target in self.filters.arrays().items():
+            fill(target, rows, held, name)
+        for name, target in self.life._asdict().items():
+            fill(target, rows, alive, name)
+        self._next_uid = int(arrays["next_uid"])
 
     def add_sensors(self, sensors: int) -> None:
         """Make room for more sensors."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 
@@ -10,6 +11,7 @@ from pydantic import ValidationError
 from trackmesh.protocol.errors import RefusedMessage, TrackmeshError
 from trackmesh.protocol.files import RegistrationRecord, Tick, UnitRecord
 from trackmesh.protocol.messages import Geodetic, Message, PlotBatch, RefinedFrame, SensorInfo, TrackFrame
+from trackmesh.services.fusion import snapshot
 from trackmesh.services.fusion.engine import FusionEngine, Unit
 from trackmesh.services.fusion.intake import Intake
 from trackmesh.services.fusion.settings import EngineSettings
@@ -38,6 +40,7 @@ class OfflineRun:
         self._origin = origin
         self._intake = Intake(0, 0)
         self._registration: RegistrationRecord | None = None
+        self._state: str | None = None
         self.engine: FusionEngine | None = None
         self.on_refined: Callable[[RefinedFrame], None] | None = None
         self.refused: Counter[str] = Counter()
@@ -93,10 +96,14 @@ class OfflineRun:
             raise TrackmeshError("The black box was recorded with settings of another version of trackmesh.") from None
         self._unit = Unit(record.unit_id, record.unit_number, record.boot_id, record.first_track_number)
         self._registration = record.registration
+        self._state = record.state
 
     def _running(self) -> FusionEngine:
         if self.engine is None:
             self.engine = FusionEngine(self._settings, self._unit, self._origin)
+            if self._state is not None:
+                # The run began with the tracks of the one before it.
+                self.engine.restore(snapshot.from_bytes(base64.b64decode(self._state)))
             if self._registration is not None:
                 # As old as it was at the start of the recorded run, which wrote that moment into it.
                 self.engine.corrections.restore(self._registration, self._registration.t_ns)

@@ -11,13 +11,14 @@ from trackmesh.protocol.buffer import Buffer
 from trackmesh.protocol.bus import Query, Sample
 from trackmesh.protocol.codec import decode, encode, encoding, open_envelope
 from trackmesh.protocol.errors import QueryFailed, RefusedMessage, TrackmeshError
-from trackmesh.protocol.files import RegistrationRecord, Tick, read_records, replace_with
+from trackmesh.protocol.files import Tick
 from trackmesh.protocol.keys import kind_and_id, last_chunk
 from trackmesh.protocol.messages import PlotBatch, SensorHealth, SensorInfo, TrackFrame, TrackQuery
 from trackmesh.protocol.serving import answers
 from trackmesh.services.fusion.black_box import BlackBox
 from trackmesh.services.fusion.engine import FusionEngine, Unit
 from trackmesh.services.fusion.intake import Intake
+from trackmesh.services.fusion.keeping import Keeper
 from trackmesh.services.fusion.picture import TRACK_EPOCH_MS
 from trackmesh.services.fusion.settings import FusionSettings
 from trackmesh.services.fusion.warm_up import warm_up
@@ -30,7 +31,6 @@ _PLOTS_WAITING = 4096
 _BATCHES_HELD = 64
 _SENSORS_HELD = 256
 _ASK_EVERY_S = 0.5
-_SAVE_EVERY_S = 60.0
 
 
 class FusionService:
@@ -41,23 +41,27 @@ class FusionService:
         self.settings = settings
         first = time.time_ns() // 1_000_000 - TRACK_EPOCH_MS
         self.unit = Unit(settings.unit_id, settings.unit_number, runtime.boot_id, first)
-        self.engine = FusionEngine(settings.engine, self.unit, settings.origin)
+        self.engine = self._new_engine()
         self.intake = Intake(int(settings.max_age_s * 1e9), int(settings.max_ahead_s * 1e9))
         self._lock = threading.Lock()
         self._alive: set[str] = set()
         self._held: dict[str, deque[PlotBatch]] = {}
         self._answered: Buffer[SensorInfo] = Buffer(_SENSORS_HELD)
         self._tick_due_s = 0.0
-        self._save_due_s = 0.0
+        self._keeper = Keeper(settings, runtime.log, runtime.counters.count)
         self._black_box: BlackBox | None = None
+
+    def _new_engine(self) -> FusionEngine:
+        return FusionEngine(self.settings.engine, self.unit, self.settings.origin)
 
     def start(self) -> None:
         """Compile, subscribe, serve, and be ready."""
         runtime, keys = self.runtime, self.runtime.keys
-        restored = self._restore_registration()
+        self.engine, state = self._keeper.engine(self._new_engine, self.intake)
+        biases = self._keeper.restore_biases(self.engine) if state is None else None
         if self.settings.black_box is not None:
             self._black_box = BlackBox(
-                self.settings.black_box, self.unit, self.settings.engine, self.settings.origin, restored
+                self.settings.black_box, self.unit, self.settings.engine, self.settings.origin, biases, state
             )
             runtime.on_exit(self._black_box.close)
         runtime.set_state("compiling")
@@ -67,7 +71,8 @@ class FusionService:
         self._frames = runtime.bus.publisher(keys.tracks(self.unit.unit_id), history=_FRAMES_KEPT)
         self._refined = runtime.bus.publisher(keys.refined(self.unit.unit_id), history=_FRAMES_KEPT)
         self._biases = runtime.bus.publisher(keys.registration(self.unit.unit_id), history=1)
-        runtime.on_exit(self._save_registration)
+        runtime.on_exit(self._keeper.write_waiting)
+        runtime.on_exit(lambda: self._keeper.keep(self.engine, self.intake, now=True))
         # The engine's thread may publish until it has ended.
         runtime.on_exit(self._frames.close)
         runtime.on_exit(self._refined.close)
@@ -79,6 +84,8 @@ class FusionService:
         runtime.closing(runtime.bus.serve(keys.service("tracks", self.unit.unit_id), self.answer))
         runtime.spawn("engine", self._run)
         runtime.spawn("asker", self._ask_unknown)
+        if self.settings.state_file is not None:
+            runtime.spawn("state", lambda: self._keeper.write_states(runtime.stopping))
         runtime.set_state("ready")
 
     def answer(self, query: Query) -> Iterator[tuple[bytes, str]]:
@@ -105,6 +112,8 @@ class FusionService:
     # --- the engine's thread ---
 
     def _run(self) -> None:
+        # Kept tracks must grow old before plots come that could be taken for theirs.
+        self._tick_if_due()
         while not self.runtime.stopping.is_set():
             self._drain()
             sample = self._plots.receive(timeout_s=self.settings.tick_s)
@@ -197,35 +206,12 @@ class FusionService:
             self._frames.put(encode(frame), encoding(frame))
             self.runtime.counters.count("frames")
             # Only this thread changes the engine.
+            self._keeper.keep(self.engine, self.intake)
             refined, biases = self.engine.refined(), self.engine.registration()
             if refined is not None:
                 self._refined.put(encode(refined), encoding(refined))
             if biases is not None:
                 self._biases.put(encode(biases), encoding(biases))
-                if time.monotonic() > self._save_due_s:
-                    self._save_registration()
-
-    def _restore_registration(self) -> RegistrationRecord | None:
-        path = self.settings.registration_file
-        if path is None or not path.exists():
-            return None
-        record = next(read_records(path, RegistrationRecord), None)
-        if not isinstance(record, RegistrationRecord):
-            raise TrackmeshError(f"{path} holds no registration.")
-        self.runtime.log.info("biases of %d sensors from %s", len(record.state.get("sensors", [])), path)
-        return self.engine.corrections.restore(record, time.time_ns())
-
-    def _save_registration(self) -> None:
-        self._save_due_s = time.monotonic() + _SAVE_EVERY_S
-        path, now_ns = self.settings.registration_file, self.engine.now_ns
-        record = self.engine.corrections.record(now_ns) if now_ns is not None else None
-        if path is None or record is None:
-            return
-        try:
-            replace_with(path, record)
-        except TrackmeshError as error:
-            self.runtime.log.error("the biases are not kept: %s", error)
-            self.runtime.counters.count("registration_file_failures")
 
     def _record(self, record: SensorInfo | PlotBatch | Tick) -> None:
         if self._black_box is None:

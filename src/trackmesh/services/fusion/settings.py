@@ -15,6 +15,7 @@ from trackmesh.services.estimation.bank import Branch, make_models
 from trackmesh.services.estimation.filters import FilterName, generic_models, manoeuvre_models, velocity_models
 from trackmesh.services.estimation.imm_tracks import ImmTracks
 from trackmesh.services.estimation.pairs import PairRules
+from trackmesh.services.fusion.association import SequentialTest
 from trackmesh.services.fusion.biases import RegistrationRules
 from trackmesh.services.fusion.inputs import InputRules
 from trackmesh.services.fusion.layer import TrackFilters
@@ -108,6 +109,9 @@ class EngineSettings(BaseModel):
     input_error_m: NonNegative = Field(
         0.0, description="error of other units' positions that their covariances do not know, one sigma per axis"
     )
+    input_reference: bool = Field(
+        False, description="other units' positions are right, but for input_error_m: learn the sensors' biases from them"
+    )
     frame_period_s: NonNegative = Field(0.0, description="least time between frames; 0: one after every batch")
     idle_frame_s: Positive = Field(1.0, description="time between frames while no data comes")
     publish_tentative: bool = False
@@ -130,14 +134,19 @@ class EngineSettings(BaseModel):
 
     def pair_test(self) -> PairTest:
         """A new test between the local tracks of two sensors."""
-        rules = PairRules(speed_mps=self.pair_speed_mps, radius_m=self.pair_radius_m)
-        if self.noise_tails == "gaussian":
-            rules = rules._replace(nu=np.inf)
-        return make_test(self.association, rules, self.association_alpha)
+        return make_test(self.association, self._pair_rules(), self.association_alpha)
 
     def input_rules(self) -> InputRules:
         """What to expect of other units."""
-        return InputRules(self.coast_s, self.stitch_s, self.input_q_m2ps3, self.input_error_m, self.pair_test)
+        return InputRules(self.coast_s, self.stitch_s, self.input_q_m2ps3, self.input_error_m, self._input_test)
+
+    def _input_test(self) -> PairTest:
+        # What both units show may be swapped in either of them: evidence of before must fade sooner.
+        return SequentialTest(self._pair_rules()._replace(memory_s=15.0, fit_memory_s=4.0))
+
+    def _pair_rules(self) -> PairRules:
+        rules = PairRules(speed_mps=self.pair_speed_mps, radius_m=self.pair_radius_m)
+        return rules._replace(nu=np.inf) if self.noise_tails == "gaussian" else rules
 
     def registration_rules(self) -> RegistrationRules:
         """What to expect of biases."""
@@ -197,6 +206,10 @@ class FusionSettings(ServiceSettings):
     max_sensors: Annotated[int, Field(ge=1, le=4096)] = Field(128, description="more sensors are refused")
     tick_s: Positive = Field(0.25, description="how often time advances without data")
     black_box: Path | None = Field(None, description="file that records the engine's inputs")
+    state_file: Path | None = Field(
+        None, description="file that keeps the tracks over restarts; read at the start, written every state_every_s"
+    )
+    state_every_s: Positive = 10.0
     registration_file: Path | None = Field(
         None, description="file that keeps the sensors' biases over restarts; read at the start, written every minute"
     )

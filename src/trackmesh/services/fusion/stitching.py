@@ -9,7 +9,7 @@ freedom. Among several the best fit counts, one to one.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -107,6 +107,19 @@ class Stitching:
         lost = len(self)
         self._keep(~np.isin(np.arange(lost), old))
         return new[which], number[old], coasting[old[old >= lost] - lost]
+
+    def kept(self) -> dict[str, npt.NDArray[Any]]:
+        """What is to be known after a restart."""
+        words = "\n".join(one.model_dump_json() for one in self._lost.words)
+        arrays = {name: getattr(self._lost, name) for name in Lost._fields[:5]}
+        return arrays | {"words": np.frombuffer(words.encode(), np.uint8)}
+
+    def restore(self, arrays: dict[str, npt.NDArray[Any]]) -> None:
+        """Go on with what ``kept`` gave."""
+        lines = arrays["words"].tobytes().decode().splitlines()
+        words = [TrackFrame.model_validate_json(line) for line in lines]
+        a = arrays
+        self._lost = Lost(a["x"], a["P"], a["t_s"], a["number"], a["first_s"], words)
 
     def _coasting(self, new: IntArray) -> IntArray:
         """Confirmed rows without a plot since the earliest of the new ones began."""
