@@ -5,9 +5,9 @@ import pytest
 import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.services.estimation.makers import LAW, FloatArray, chain, sojourns
+from tests.services.estimation.makers import LAW, MODELS, TVIMM, FloatArray, chain, sojourns
 
-from trackmesh.services.estimation.transition import generator, stationary, uniformised
+from trackmesh.services.estimation.transition import generator, modes, stationary, transition_by_modes, uniformised
 
 times_s = st.floats(0.0, 1000.0)
 
@@ -112,3 +112,29 @@ def test_a_uniformised_chain_jumps_at_one_rate(tau: FloatArray, more: int) -> No
     np.testing.assert_allclose(U3, U @ U2, atol=1e-15)
     np.testing.assert_allclose(rate * (U[:r, :r] - np.eye(r)), generator(tau), rtol=1e-12, atol=1e-15)
     assert np.array_equal(U[r:], np.eye(r + more)[r:])
+
+
+@LAW
+@given(tau=sojourns, dt=times_s, more=st.integers(0, 2))
+def test_both_ways_to_a_transition_matrix_agree(tau: FloatArray, dt: float, more: int) -> None:
+    G, size = generator(tau), len(tau) + more
+    by_modes = modes(G, size)
+    if not by_modes.usable:
+        return
+    out = np.empty((size, size))
+    transition_by_modes(*by_modes[1:], dt, out)
+    np.testing.assert_allclose(out[: len(tau), : len(tau)], chain(G, dt), atol=1e-12)
+    assert np.array_equal(out[len(tau) :], np.eye(size)[len(tau) :])
+
+
+def test_the_chains_of_the_named_filters_have_modes() -> None:
+    assert TVIMM.has_modes.tolist() == [1, 1]
+    assert MODELS.has_modes.tolist() == [1]
+
+
+def test_a_chain_that_turns_round_or_lacks_eigenvectors_has_none() -> None:
+    tau = np.full(3, 10.0)
+    ring = generator(tau, np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], float))
+    assert not modes(ring, 3).usable, "complex eigenvalues"
+    line = np.array([[-1.0, 1.0, 0.0], [0.0, -1.0, 1.0], [0.0, 0.0, 0.0]])
+    assert not modes(line, 3).usable, "one eigenvector for two equal eigenvalues"

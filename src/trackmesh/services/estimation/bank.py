@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from trackmesh.services.estimation.motion import STATES, Model
-from trackmesh.services.estimation.transition import generator, stationary, uniformised
+from trackmesh.services.estimation.transition import generator, modes, stationary, uniformised
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -56,6 +56,8 @@ class Models(Protocol):
         first: (b + 1,) first model of each branch, and r.
         jump, rate: (b, 3, width, width), (b,): each branch's chain, uniformised, and its powers; width is that of the
             longest branch.
+        has_modes: (b,) whether the chain has the form of the next three.
+        mode_rate, mode_left, mode_right: (b, width), (b, width, width) twice: see ``transition.Modes``.
         start: (r,) initial probabilities, summing to one in each branch.
         prior_count: (b,). age_s: (r,), 0 where a model has no memory of its age.
         split_s: (b,).
@@ -71,6 +73,10 @@ class Models(Protocol):
     first: IntArray
     jump: FloatArray
     rate: FloatArray
+    has_modes: IntArray
+    mode_rate: FloatArray
+    mode_left: FloatArray
+    mode_right: FloatArray
     start: FloatArray
     prior_count: FloatArray
     age_s: FloatArray
@@ -110,6 +116,7 @@ def make_models(
     ages = [b.age_s or (0.0,) * len(b.models) for b in branches]
     width = max(len(b.models) for b in branches)
     uniform = [uniformised(c, width) for c in chains]
+    by_modes = [modes(c, width) for c in chains]
     return cast(
         "Models",
         _record(
@@ -119,6 +126,10 @@ def make_models(
             first=np.cumsum([0, *(len(b.models) for b in branches)]),
             jump=np.array([jump for jump, _ in uniform]),
             rate=np.array([rate for _, rate in uniform]),
+            has_modes=np.array([int(one.usable) for one in by_modes]),
+            mode_rate=np.array([one.rate for one in by_modes]),
+            mode_left=np.array([one.left for one in by_modes]),
+            mode_right=np.array([one.right for one in by_modes]),
             start=np.concatenate(starts),
             prior_count=np.array([b.prior_count for b in branches], float),
             age_s=np.concatenate([np.array(a, float) for a in ages]),

