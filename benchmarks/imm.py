@@ -175,7 +175,7 @@ def _fill(name: str, n: int) -> None:
     every = np.arange(n)
     tracks.begin(every, next(steps))
     tracks.feed(every, next(steps))
-    tracks.predict(every, np.full(n, 4.0))
+    tracks.estimate(every, np.full(n, 4.0))
     # Not getrusage: there a new process begins with the peak of the one that started it.
     status = Path("/proc/self/status").read_text(encoding="utf-8")
     print(int(status.partition("VmHWM:")[2].split()[0]) / 1024)

@@ -122,6 +122,7 @@ def _batch(radar: Any, seq: int, scan: Any, sectors: int) -> PlotBatch:
         seq=seq,
         t_ns=np.full(n, START_NS + round(scan.time_s * 1e9)),
         columns=["range_m", "azimuth_rad"],
-        values=np.stack([scan.range_m, scan.azimuth_rad], axis=1).reshape(n, 2),
+        # Right above a radar noise can make a range negative, which no radar measures.
+        values=np.stack([np.abs(scan.range_m), scan.azimuth_rad], axis=1).reshape(n, 2),
         scan=ScanPart(index=turn, sector=sector, sectors=sectors),
     )

@@ -28,13 +28,17 @@ def benches() -> dict[str, Bench]:
     """Every benchmark by its name; a new one is a new entry."""
     # A script's own directory is on the path, not that of the package it lies in.
     sys.path.insert(0, str(HERE.parent))
-    from benchmarks import alpha_beta, association, emi, fusion, imm, wire
+    from benchmarks import alpha_beta, association, emi, fusion, fusion_cost, imm, live, recordings, tags, wire
 
     return {
         "wire": wire.rows,
         "fusion": fusion.rows,
+        "fusion-cost": fusion_cost.rows,
+        "live": live.rows,
+        "recordings": recordings.rows,
         "association": association.rows,
         "emi": emi.rows,
+        "tags": tags.rows,
         "alpha-beta": alpha_beta.rows,
         "imm": imm.rows,
     }

@@ -52,6 +52,14 @@ def test_the_fusion_engine_knows_no_clock_and_no_network() -> None:
         assert not any("bus" in n or "client" in n for n in imported), path
 
 
+def test_the_tag_engine_knows_no_clock_and_no_network() -> None:
+    for path in (ROOT / "src/trackmesh/services/tags").glob("*.py"):
+        if path.stem != "service":
+            imported = _imports(path)
+            assert not {n.split(".")[0] for n in imported} & {"time", "datetime", "logging", "threading"}, path
+            assert not any("bus" in n or "client" in n for n in imported), path
+
+
 def test_no_file_is_longer_than_two_rooms() -> None:
     long = {str(p.relative_to(ROOT)): n for p in SOURCES if (n := len(p.read_text().splitlines())) > 400}
     assert not long

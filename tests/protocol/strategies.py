@@ -13,8 +13,11 @@ from trackmesh.protocol.arrays import AnyArray, ArrayField
 from trackmesh.protocol.messages import (
     MESSAGES,
     BandFrame,
+    EmiAngles,
     EmiGeometry,
+    EmiLimit,
     EmiOptions,
+    EmiPrior,
     EmiReceiver,
     EmiResult,
     EmiScanBatch,
@@ -88,7 +91,7 @@ def arrays(kind: type[Message], **sizes: int) -> st.SearchStrategy[Fields]:
 @st.composite
 def built(draw: st.DrawFn, kind: type[Message], fields: Strategy, axes: dict[str, Strategy] | None = None) -> Message:
     """A message from ``fields`` and arrays whose named axes have drawn lengths; ``axes`` are lists along an axis."""
-    sizes = {axis: draw(lengths) for axis in "nrspcw"}
+    sizes = {axis: draw(lengths) for axis in "nrspcwa"}
     along = {name: draw(st.lists(one, min_size=sizes[axis], max_size=sizes[axis])) for (name, axis), one in _axes(axes)}
     return kind(**draw(arrays(kind, **sizes)), **along, **draw(fields))
 
@@ -135,6 +138,18 @@ def scan_parts(draw: st.DrawFn) -> ScanPart:
     return ScanPart(index=draw(counts), sector=draw(st.integers(0, sectors - 1)), sectors=sectors)
 
 
+own_motion = st.lists(real(-1e5, 1e5), min_size=3, max_size=3)
+own_places: Strategy = st.one_of(
+    st.just({}),
+    st.builds(dict, site=places, site_velocity_enu_mps=maybe(own_motion)),
+    st.builds(
+        dict,
+        site_enu_m=st.lists(real(-1e9, 1e9), min_size=3, max_size=3),
+        site_velocity_enu_mps=maybe(own_motion),
+    ),
+)
+
+
 @st.composite
 def plot_batches(draw: st.DrawFn) -> PlotBatch:
     n, columns = draw(lengths), list(draw(st.sampled_from(COLUMN_SETS)))
@@ -150,6 +165,7 @@ def plot_batches(draw: st.DrawFn) -> PlotBatch:
         variances=np.array(variances, float).T if draw(st.booleans()) else None,
         labels=draw(maybe(st.lists(texts, min_size=n, max_size=n))),
         scan=draw(maybe(scan_parts())),
+        **draw(own_places),
     )
 
 
@@ -158,7 +174,21 @@ def range_batches(draw: st.DrawFn) -> RangeBatch:
     tags, readers = (draw(st.lists(ids, min_size=1, max_size=3)) for _ in range(2))
     given_ = draw(arrays(RangeBatch, n=draw(lengths)))
     given_ |= {"tag": given_["tag"] % len(tags), "reader": given_["reader"] % len(readers)}
+    # Either ranges, with or without variances, or signal strengths.
+    if given_["range_m"] is None or draw(st.booleans()):
+        given_ |= {"range_m": None, "variance_m2": None}
+    if given_["range_m"] is not None or given_["rssi_dbm"] is None:
+        given_["rssi_dbm"] = None if given_["range_m"] is not None else np.full(len(given_["t_ns"]), -60.0)
     return RangeBatch(network_id=draw(ids), tags=tags, readers=readers, **given_, **draw(fields(**header)))
+
+
+@st.composite
+def tag_frames(draw: st.DrawFn) -> TagFrame:
+    n, s = draw(lengths), draw(lengths)
+    tag_id, readers = (draw(st.lists(ids, min_size=k, max_size=k)) for k in (n, s))
+    given_ = draw(arrays(TagFrame, n=n, m=draw(lengths) if n and s else 0))
+    given_["used"] = given_["used"] % np.array([max(n, 1), max(s, 1)], "<u4")
+    return TagFrame(tag_id=tag_id, readers=readers, **given_, **draw(fields(**unit, origin=maybe(places))))
 
 
 query_fields: dict[str, Strategy] = {
@@ -198,34 +228,54 @@ transmitters = st.builds(
     axis=st.lists(real(-1e5, 1e5), min_size=3, max_size=3).filter(lambda v: math.hypot(*v) >= 1e-6),
     offset_m=vectors,
 )
-receivers = st.builds(EmiReceiver, offset_m=vectors, components=st.sampled_from(["xyz", "z"]))
+directions = st.lists(real(-1e5, 1e5), min_size=3, max_size=3).filter(lambda v: math.hypot(*v) >= 1e-6)
+receivers = st.builds(
+    EmiReceiver,
+    offset_m=vectors,
+    components=st.sampled_from(["xyz", "z"]) | st.lists(directions, min_size=1, max_size=3),
+    radius_m=real(0, 1e3),
+)
+priors = st.builds(EmiPrior, position_m=vectors, sd_m=st.lists(real(1e-300, 1e3), min_size=3, max_size=3))
+areas = st.lists(real(), min_size=4, max_size=4).filter(lambda a: a[0] != a[2] and a[1] != a[3])
 options = st.builds(
     EmiOptions,
     background=st.sampled_from(["none", "const", "plane"]),
     robust=st.booleans(),
     depth_min_m=real(1e-300, 1),
     depth_max_m=maybe(real(1, 1e3, exclude_min=True)),
+    max_targets=st.integers(1, 3),
+    side=st.sampled_from(["below", "above", "unknown"]),
+    area_m=maybe(areas),
+    prior=maybe(priors),
+    block_m=maybe(real(1e-300, 1e3)),
 )
 
 
 @st.composite
 def scan_batches(draw: st.DrawFn) -> EmiScanBatch:
-    w, receiver = draw(st.integers(1, 3)), draw(receivers)
-    k = 3 if receiver.components == "xyz" else 1
+    w, several = draw(st.integers(1, 3)), draw(st.lists(receivers, min_size=1, max_size=2))
+    k = sum(receiver.n_components for receiver in several)
     shape = (draw(st.integers(1, 2)), draw(st.integers(1, 2)), w, k)
     axes = draw(npst.arrays("<f8", (w, 3), elements=real(-1e6, 1e6)))
     geometry = EmiGeometry(
         positions_m=draw(npst.arrays("<f8", (w, 3), elements=real(-1e3, 1e3))),
         transmitter=draw(transmitters),
-        receiver=receiver,
+        receiver=several[0],
+        receivers=several if len(several) > 1 else draw(maybe(st.just(several))),
         axes=axes if (np.linalg.norm(axes, axis=1) >= 1e-6).all() else None,
+        attitude=draw(maybe(st.just(np.ones((w, 4))))),
     )
     positive = real(0, exclude_min=True)
     sigma = draw(maybe(positive | st.lists(positive, min_size=k, max_size=k)))
     factor = draw(maybe(npst.arrays("<f8", (w,), elements=real(1e-9, 1e9))))
+    by_channel = draw(maybe(npst.arrays("<f8", (shape[1],), elements=real(1e-9, 1e9))))
+    sent = draw(st.booleans())
     return EmiScanBatch(
         batch_id=draw(ids),
-        geometry=geometry,
+        geometry=geometry if sent else None,
+        geometry_id=draw(maybe(ids)) if sent else draw(ids),
+        channels=draw(maybe(st.lists(texts, min_size=shape[1], max_size=shape[1]))),
+        channel_factor=None if sigma is None else by_channel,
         field=draw(npst.arrays("<f8", shape, elements=st.just(math.nan) | real())),
         field_unit=draw(st.sampled_from(["T", "nT", "pT", "arbitrary"])),
         sigma=sigma,
@@ -234,6 +284,15 @@ def scan_batches(draw: st.DrawFn) -> EmiScanBatch:
     )
 
 
+angles = built(
+    EmiAngles,
+    fields(
+        theta_rad=maybe(real()),
+        phi_rad=maybe(real()),
+        psi_rad=maybe(real()),
+        undefined=st.dictionaries(texts, texts, max_size=3),
+    ),
+)
 targets = built(
     EmiTarget,
     fields(
@@ -244,6 +303,12 @@ targets = built(
         shape=st.sampled_from([None, "isotropic", "axisymmetric", "general"]),
         axis=maybe(vectors),
         axis_sd_rad=maybe(real(0)),
+        p_isotropic=maybe(real(0, 1)),
+        p_axisymmetric=maybe(real(0, 1)),
+        angles=maybe(angles),
+        channel=counts,
+        inflation=real(0, exclude_min=True),
+        ambiguous=st.sampled_from([None, "mirror"]),
     ),
 )
 results = st.builds(
@@ -262,6 +327,11 @@ results = st.builds(
     n_masked=counts,
     n_outliers=counts,
     iterations=counts,
+    local_chi2=maybe(real()),
+    bic=st.lists(real(), max_size=4),
+    limit=maybe(built(EmiLimit, fields())),
+    unit_id=maybe(ids),
+    geometry_id=maybe(ids),
 )
 
 healths = st.builds(
@@ -323,7 +393,7 @@ VALID: dict[type[TopMessage], Strategy] = {
     RangeBatch: range_batches(),
     TrackFrame: built(TrackFrame, fields(**unit, origin=maybe(places)), {"models:r": texts, "sensors:s": ids}),
     RefinedFrame: built(RefinedFrame, fields(**unit, lag=st.integers(1, 4))),
-    TagFrame: built(TagFrame, fields(**unit, origin=maybe(places)), {"tag_id:n": ids}),
+    TagFrame: tag_frames(),
     TrackQuery: st.builds(TrackQuery, **query_fields),
     HistoryQuery: history_queries(),
     BandFrame: built(BandFrame, fields(**unit)),

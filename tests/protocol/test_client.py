@@ -170,12 +170,6 @@ def test_one_result_a_scan(bus: MemoryBus, client: Client) -> None:
     assert list(client.invert(scans(4))) == [emi_result(i) for i in range(4)]
 
 
-def test_a_batch_goes_to_one_service_only(bus: MemoryBus, client: Client) -> None:
-    serve_scans(bus, client, "a")
-    serve_scans(bus, client, "b")
-    assert [r.index for r in client.invert(scans(4))] == [0, 1, 2, 3]
-
-
 def test_results_come_before_the_end(bus: MemoryBus, client: Client) -> None:
     go_on = threading.Event()
 

@@ -25,6 +25,7 @@ from tests.protocol.test_messages import PLOTS, RADAR
 from trackmesh.protocol.errors import RefusedMessage, TrackmeshError
 from trackmesh.protocol.files import (
     RECORD_TYPES,
+    Gone,
     RecordWriter,
     RegistrationRecord,
     Tick,
@@ -52,6 +53,7 @@ RECORDS: dict[type[Message], st.SearchStrategy[Any]] = {
     RegistrationRecord: registrations,
     Geodetic: places,
     Tick: st.builds(Tick, t_ns=times_ns),
+    Gone: st.builds(Gone, sensor_id=ids),
     **{kind: VALID[kind] for kind in RECORD_TYPES.values() if issubclass(kind, TopMessage)},
 }
 SENSOR_LINE = json.dumps({"type": "sensor"} | RADAR)

@@ -19,11 +19,13 @@ from trackmesh.protocol.messages import (
     MESSAGES,
     EmiResult,
     EmiScanBatch,
+    Geodetic,
     HistoryQuery,
     PlotBatch,
     RangeBatch,
     ScanPart,
     SensorInfo,
+    TagFrame,
     TrackFrame,
     TrackQuery,
     TruthFrame,
@@ -50,6 +52,22 @@ RADAR: dict[str, Any] = {
     "sigma": {"range_m": 50.0, "azimuth_rad": 1e-3},
 }
 TRUTH: dict[str, Any] = {"scenario_id": "s", "t_ns": 1, "id": [1], "state": [[0.0, 0.0, 0.0, 0.0]]}
+TAGS: dict[str, Any] = {
+    "unit_id": "main",
+    "boot_id": "b",
+    "seq": 0,
+    "t_ns": 1,
+    "tag_id": ["t"],
+    "status": [1],
+    "state": [[0.0] * 6],
+    "covariance": [[1.0] * 21],
+    "quality": [1.0],
+    "certainty": [1.0],
+    "other": [[0.0, 0.0]],
+    "readers": ["r"],
+    "used": [[0, 0]],
+    "updated_t_ns": [1],
+}
 RANGES: dict[str, Any] = {
     "network_id": "hall",
     "boot_id": "b",
@@ -217,10 +235,33 @@ def test_covariances_are_unpacked_row_by_row() -> None:
         ("scan", {"index": 0, "sector": 4, "sectors": 4}, "out_of_bounds"),
         ("scan", {"index": -1, "sector": 0, "sectors": 4}, "out_of_bounds"),
         ("scan", 3, "invalid"),
+        ("site", {"latitude_deg": 91.0, "longitude_deg": 0.0}, "out_of_bounds"),
+        ("site_enu_m", [0.0, 0.0], "wrong_length"),
+        ("site_enu_m", [0.0, 0.0, 1e300], "out_of_bounds"),
+        ("site_enu_m", [0.0, 0.0, np.nan], "not_finite"),
+        ("site_velocity_enu_mps", [1.0, 0.0, 0.0], "missing_field"),
     ],
 )  # fmt: skip
 def test_a_batch_of_plots_is_refused_with_its_reason(path: str, value: Any, reason: str) -> None:
     assert refusal(PlotBatch, changed(PLOTS, path, value)).reason == reason
+
+
+MOVING = PLOTS | {"site_enu_m": [1.0, 2.0, 3.0], "site_velocity_enu_mps": [8.0, 0.0, 0.0]}
+
+
+def test_a_batch_says_where_its_sensor_stood_in_one_way() -> None:
+    place = {"latitude_deg": 1.0, "longitude_deg": 2.0}
+    assert refusal(PlotBatch, MOVING | {"site": place}).reason == "invalid"
+    assert refusal(PlotBatch, MOVING | {"site_velocity_enu_mps": [2e5, 0.0, 0.0]}).reason == "out_of_bounds"
+    moving = decode(msgpack.packb(MOVING), PlotBatch)
+    assert (moving.site_enu_m, moving.site_velocity_enu_mps) == ([1.0, 2.0, 3.0], [8.0, 0.0, 0.0])
+    geodetic = changed(MOVING, "site_enu_m", ...) | {"site": place}
+    assert decode(msgpack.packb(geodetic), PlotBatch).site == Geodetic(latitude_deg=1.0, longitude_deg=2.0)
+
+
+def test_a_batch_of_a_sensor_that_knows_nothing_of_moving_is_one_of_a_sensor_at_rest() -> None:
+    old = decode(msgpack.packb(PLOTS), PlotBatch)
+    assert (old.site, old.site_enu_m, old.site_velocity_enu_mps) == (None, None, None)
 
 
 @pytest.mark.parametrize(("columns", "i"), [(columns, i) for columns in COLUMN_SETS for i in range(len(columns))])
@@ -298,6 +339,15 @@ def test_a_position_sensor_needs_no_site() -> None:
         (RangeBatch, changed(RANGES, "reader", [-1]), "out_of_bounds"),
         (RangeBatch, changed(RANGES, "tags", ["T"]), "invalid_id"),
         (RangeBatch, changed(RANGES, "tags", ["t"] * 20_001), "wrong_length"),
+        (RangeBatch, changed(RANGES, "range_m", None), "missing_field"),
+        (RangeBatch, changed(RANGES, "rssi_dbm", [-60.0]), "missing_field"),
+        (RangeBatch, changed(RANGES, "range_m", [2e6]), "out_of_bounds"),
+        (RangeBatch, RANGES | {"range_m": None, "rssi_dbm": [-60.0], "variance_m2": [1.0]}, "invalid"),
+        (RangeBatch, RANGES | {"range_m": None, "rssi_dbm": [101.0]}, "out_of_bounds"),
+        (TagFrame, changed(TAGS, "used", [[1, 0]]), "out_of_bounds"),
+        (TagFrame, changed(TAGS, "used", [[0, 1]]), "out_of_bounds"),
+        (TagFrame, changed(TAGS, "quality", [1.5]), "out_of_bounds"),
+        (TagFrame, changed(TAGS, "other", [[0.0, 0.0, 0.0]]), "wrong_length"),
         (TrackQuery, {"track_ids": [2**53 + 1]}, "out_of_bounds"),
         (TrackQuery, {"track_ids": [-1]}, "out_of_bounds"),
         (TrackQuery, {"track_ids": [True]}, "invalid"),

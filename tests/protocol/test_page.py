@@ -143,7 +143,7 @@ def test_the_page_tells_every_key() -> None:
     }
     families |= {
         key("x") for key in (keys.plots, keys.ranges, keys.sensor, keys.tracks, keys.refined, keys.tags, keys.band,
-                             keys.registration, keys.truth)
+                             keys.registration, keys.truth, keys.asking)
     }  # fmt: skip
     told = {re.sub(r"\{\w+\}", "x", cells[0].strip("`")) for cells in rows(sections()["Keys"])}
     assert {f"realm/@v1/{key}" for key in told} == families

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.protocol.builders import frame
 
-from trackmesh.protocol.messages import ENDED, TrackFrame
+from trackmesh.protocol.messages import ENDED, UNKNOWN_HEIGHT_M2, TrackFrame
 from trackmesh.protocol.picture import TrackPicture
 
 
@@ -119,3 +119,15 @@ def test_the_picture_is_that_of_a_plain_dictionary(told: list[tuple[str, set[int
     assert picture.track_id.tolist() == sorted(want)
     assert picture.unit_id == [want[m][3] for m in sorted(want)]
     assert picture.epoch.tolist() == [want[m][0] for m in sorted(want)]
+
+
+def test_heights_that_are_not_known_are_not_told_as_heights() -> None:
+    told = frame([1, 2], unit="a").model_copy(
+        update={"height_m": np.array([8e3, 0.0]), "height_variance_m2": np.array([400.0, UNKNOWN_HEIGHT_M2])}
+    )
+    assert told.height_known().tolist() == [True, False]
+    assert frame([3]).height_known().tolist() == [False]
+    merged = TrackPicture()
+    merged.update(told)
+    merged.update(frame([3], unit="b"))
+    np.testing.assert_array_equal(merged.picture().height_m, [8e3, np.nan, np.nan])

@@ -40,6 +40,19 @@ def test_a_batch_made_elsewhere_keeps_its_number_and_others_go_on_from_it() -> N
     assert [(b.boot_id, b.seq) for b in received] == [("b", 7), ("b", 8)]
 
 
+def test_a_sensor_that_moves_says_where_it_stood() -> None:
+    with MemoryBus() as bus, SensorPublisher(bus, "test", INFO) as sensor:
+        plots = bus.subscribe(Keys("test").plots("*"))
+        sent = sensor.publish(
+            [8], ["range_m", "azimuth_rad"], [[1000.0, 0.5]], site_enu_m=(1.0, 2.0, 3.0),
+            site_velocity_enu_mps=(8.0, 0.0, 0.0),
+        )  # fmt: skip
+        received = plots.receive(1.0)
+    assert received is not None
+    assert decode(received.payload, PlotBatch, received.encoding) == sent
+    assert (sent.site_enu_m, sent.site_velocity_enu_mps) == ([1.0, 2.0, 3.0], [8.0, 0.0, 0.0])
+
+
 def test_a_batch_of_another_sensor_is_refused() -> None:
     refused = pytest.raises(RefusedMessage, match="cannot publish plots of east")
     with MemoryBus() as bus, SensorPublisher(bus, "test", INFO) as sensor, refused:

@@ -39,7 +39,7 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_the_packaged_scenarios_load() -> None:
-    assert {"two-radars", "many"} <= set(scenario_names())
+    assert {"two-radars", "many", "rfid19"} <= set(scenario_names())
     for name in scenario_names():
         assert load_scenario(name).name == name
 
@@ -82,7 +82,7 @@ def test_a_radar_id_used_twice_is_refused(tmp_path: Path) -> None:
 
 
 def test_an_unknown_scenario_names_the_known_ones(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match=r"no scenario 'nothing'.*many, two-radars"):
+    with pytest.raises(ScenarioError, match=r"no scenario 'nothing'.*many, rfid19, two-radars"):
         load_scenario("nothing")
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(ScenarioError, match="not UTF-8"):

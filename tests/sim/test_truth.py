@@ -37,13 +37,13 @@ def scenarios(draw: st.DrawFn) -> Scenario:
 @given(scenarios(), st.integers(0, 2**32))
 def test_targets_stay_inside_the_area(scenario: Scenario, seed: int) -> None:
     truth = make_truth(scenario, seed)
-    area = np.array(scenario.targets.area_enu_m)
+    area = np.array(scenario.seen_targets().area_enu_m)
     slack = 1e-5 + 1e-9 * np.abs(area).max()
     for t_s in np.linspace(0.0, truth.horizon_s, 150):
         ids, states = truth.state_at(t_s)
         assert (states[:, :2] >= area[:2] - slack).all()
         assert (states[:, :2] <= area[2:] + slack).all()
-        assert len(ids) <= scenario.targets.count
+        assert len(ids) <= scenario.seen_targets().count
         assert len(set(ids.tolist())) == len(ids)
 
 
@@ -88,12 +88,12 @@ def test_the_paths_solve_their_equation_of_motion(two_radars: Scenario) -> None:
 def test_quiet_targets_never_turn_and_are_replaced(two_radars: Scenario) -> None:
     truth = make_truth(two_radars, 1, 3000.0)
     quiet = np.flatnonzero(truth.quiet)
-    assert len(quiet) > two_radars.targets.quiet_count
+    assert len(quiet) > two_radars.seen_targets().quiet_count
     assert not truth.legs.turn_rate_rad_s[truth.legs.at(quiet, truth.born_s[quiet])].any()
     for t_s in np.linspace(0.0, 3000.0, 40):
         there = truth.alive(t_s)
-        assert there[quiet].sum() == two_radars.targets.quiet_count
-        assert there.sum() == two_radars.targets.count
+        assert there[quiet].sum() == two_radars.seen_targets().quiet_count
+        assert there.sum() == two_radars.seen_targets().count
 
 
 def test_the_share_of_turning_is_what_was_asked() -> None:
@@ -110,7 +110,7 @@ def test_the_share_of_turning_is_what_was_asked() -> None:
 
 
 def test_births_and_deaths(two_radars: Scenario) -> None:
-    targets = two_radars.targets.model_copy(update={"appear_s": 30.0, "lifetime_s": (40.0, 60.0), "quiet_count": 0})
+    targets = two_radars.seen_targets().model_copy(update={"appear_s": 30.0, "lifetime_s": (40.0, 60.0), "quiet_count": 0})
     truth = make_truth(two_radars.model_copy(update={"targets": targets}), 1)
     assert (truth.born_s <= 30.0).all()
     assert (truth.born_s > 0.0).all()
@@ -136,7 +136,7 @@ def test_a_world_looks_further_when_asked(two_radars: Scenario) -> None:
     assert world.truth(301.0).horizon_s >= 301.0
     frame = truth_frame(world, 500.5, 10**18)
     assert frame.t_ns == 10**18 + 500_500_000_000
-    assert len(frame.id) == two_radars.targets.count
+    assert len(frame.id) == two_radars.seen_targets().count
 
 
 @pytest.mark.parametrize("t_s", [-5.0, 0.0, 299.999])

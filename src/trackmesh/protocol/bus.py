@@ -13,6 +13,10 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 """Where a router is looked for, and listens, unless told otherwise."""
 
 
+WAITING = 64
+"""How many questions may wait for a worker, unless a server says otherwise; more are refused at once."""
+
+
 class Sample(NamedTuple):
     """One message as it came."""
 
@@ -115,7 +119,7 @@ class Bus(Protocol):
         envelopes tell. The question is sent by the call itself, not by the first step of the iteration.
         """
 
-    def serve(self, key: str, handler: QueryHandler, *, workers: int = 2) -> Closeable:
+    def serve(self, key: str, handler: QueryHandler, *, workers: int = 2, waiting: int = WAITING) -> Closeable:
         """Answer queries to a key, ``workers`` at a time; a bounded number waits, more are answered ``busy``."""
 
     def declare_alive(self, key: str) -> Closeable:

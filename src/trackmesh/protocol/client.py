@@ -11,13 +11,15 @@ from __future__ import annotations
 
 import logging
 import time
+import uuid
 from collections import Counter
 from collections.abc import Iterator
 from typing import Generic, NamedTuple, Self, TypeVar
 
 from trackmesh.protocol.bus import Bus, Sample, Subscription
 from trackmesh.protocol.codec import decode, encode, encoding, open_envelope
-from trackmesh.protocol.errors import BusError, RefusedMessage, Unavailable
+from trackmesh.protocol.errors import QueryFailed, RefusedMessage, Unavailable
+from trackmesh.protocol.inversion import Incomplete, Inversion
 from trackmesh.protocol.keys import DEFAULT_REALM, Keys, kind_and_id, last_chunk
 from trackmesh.protocol.messages import (
     EmiResult,
@@ -27,14 +29,26 @@ from trackmesh.protocol.messages import (
     Registration,
     SensorInfo,
     ServiceStatus,
+    TagFrame,
     TrackFrame,
     TrackQuery,
 )
 from trackmesh.protocol.messages.base import TopMessage
 from trackmesh.protocol.picture import Picture, TrackPicture
+from trackmesh.protocol.ranging import RangePublisher
 from trackmesh.protocol.sensor import SensorPublisher
 
-__all__ = ["Client", "Incomplete", "Picture", "SensorPublisher", "TrackPicture", "Watch", "message_of"]
+__all__ = [
+    "Client",
+    "Incomplete",
+    "Inversion",
+    "Picture",
+    "RangePublisher",
+    "SensorPublisher",
+    "TrackPicture",
+    "Watch",
+    "message_of",
+]
 
 M = TypeVar("M", bound=TopMessage)
 
@@ -42,18 +56,6 @@ _log = logging.getLogger(__name__)
 
 _NAMES = ("sensor_id", "network_id", "unit_id", "scenario_id")
 _SERVED_BY = {"tracks": "fusion", "history": "archive", "emi": "emi"}
-
-
-class Incomplete(BusError):
-    """A service ended half-way through its answer.
-
-    Attributes:
-        received: how many answers came before.
-    """
-
-    def __init__(self, sentence: str, received: int) -> None:
-        super().__init__(sentence)
-        self.received = received
 
 
 def message_of(sample: Sample, kind: type[M]) -> M:
@@ -117,11 +119,16 @@ class Watch(Generic[M]):
 class _Stream(NamedTuple):
     """What was asked of whom, for the sentence when it goes wrong."""
 
-    kind: str
+    service: str
     unit: str
     asked_s: float
     timeout_s: float
     expected: int | None
+
+    @property
+    def kind(self) -> str:
+        """Of the services that answer."""
+        return _SERVED_BY[self.service]
 
     def broken_off(self, unit: str, received: int) -> Incomplete:
         late = time.monotonic() - self.asked_s >= self.timeout_s
@@ -141,6 +148,7 @@ class Client:
     def __init__(self, bus: Bus, realm: str = DEFAULT_REALM) -> None:
         self.bus = bus
         self.keys = Keys(realm)
+        self._geometries: set[tuple[str, str]] = set()
 
     # --- watching ---
 
@@ -151,6 +159,10 @@ class Client:
     def watch_refined(self, unit: str = "*", *, capacity: int = 4096) -> Watch[RefinedFrame]:
         """Refined states of some plots ago, of units whose ``lag`` is set."""
         return Watch(self.bus.subscribe(self.keys.refined(unit), history=True, capacity=capacity), RefinedFrame)
+
+    def watch_tags(self, unit: str = "*", *, history: bool = True, capacity: int = 4096) -> Watch[TagFrame]:
+        """Pictures of the tags as they are published."""
+        return Watch(self.bus.subscribe(self.keys.tags(unit), history=history, capacity=capacity), TagFrame)
 
     def watch_registration(self, unit: str = "*") -> Watch[Registration]:
         """What units think is wrong with their sensors, the present first."""
@@ -180,17 +192,40 @@ class Client:
         """Past frames, as the archive finds them; raises as ``query_tracks``."""
         return self._ask("history", query, TrackFrame, unit, timeout_s)
 
-    def invert(self, batch: EmiScanBatch, unit: str = "*", *, timeout_s: float = 60.0) -> Iterator[EmiResult]:
-        """One result a scan, each as it is done; by one service, whichever is alive where ``unit`` is not given.
+    def invert(self, batch: EmiScanBatch, unit: str = "*", *, timeout_s: float = 60.0) -> Inversion:
+        """One result a scan, each as it is done, by all EMI services that are alive, or by ``unit``.
 
-        Raises:
-            Unavailable: no service answers.
-            Incomplete: the service ended before all scans were done.
-            QueryFailed: the service answers with an error.
+        The batch is sent in portions. A service is sent a geometry once, and then told its name. See ``Inversion`` for
+        progress, ``cancel``, and what iterating over it raises.
         """
-        if unit == "*":
-            unit = next(iter(self._alive_units("emi")), "*")
-        return self._ask("emi", batch, EmiResult, unit, timeout_s, expected=len(batch.field))
+        units = (self._alive_units("emi") or ["*"]) if unit == "*" else [unit]
+        asker, asked_s = uuid.uuid4().hex, time.monotonic()
+        token = self.bus.declare_alive(self.keys.asking(asker))
+
+        def ask(name: str, part: EmiScanBatch) -> Iterator[EmiResult]:
+            return self._ask_scans(name, part, asker, asked_s, timeout_s)
+
+        return Inversion(ask, units, batch, token, asked_s + timeout_s)
+
+    def _ask_scans(
+        self, unit: str, batch: EmiScanBatch, asker: str, asked_s: float, timeout_s: float
+    ) -> Iterator[EmiResult]:
+        geometry_id = batch.geometry_id or (batch.geometry.content_id() if batch.geometry else "")
+        named = batch.model_copy(update={"geometry": None, "geometry_id": geometry_id})
+        known = (unit, geometry_id) in self._geometries or batch.geometry is None
+        stream = _Stream("emi", unit, asked_s, timeout_s, len(batch.field))
+        parameters = f"asking={asker}"
+        try:
+            for result in self._stream(named if known else batch, EmiResult, stream, parameters):
+                if result.geometry_id == geometry_id:
+                    self._geometries.add((unit, geometry_id))
+                yield result
+        except QueryFailed as error:
+            if error.code != "unknown_geometry" or batch.geometry is None:
+                raise
+            # The service has been started again, or has heard of too many others since.
+            self._geometries.discard((unit, geometry_id))
+            yield from self._stream(batch, EmiResult, stream, parameters)
 
     def sensors(self, sensor: str = "*", *, timeout_s: float = 2.0) -> list[SensorInfo]:
         """The sensors that are there, ordered by id; those that do not answer well are left out."""
@@ -233,13 +268,15 @@ class Client:
 
     # --- how ---
 
-    def _ask(
-        self, service: str, query: TopMessage, kind: type[M], unit: str, timeout_s: float, expected: int | None = None
-    ) -> Iterator[M]:
-        asked_s = time.monotonic()
-        replies = self.bus.query(self.keys.service(service, unit), encode(query), encoding(query), timeout_s=timeout_s)
+    def _ask(self, service: str, query: TopMessage, kind: type[M], unit: str, timeout_s: float) -> Iterator[M]:
+        return self._stream(query, kind, _Stream(service, unit, time.monotonic(), timeout_s, None))
+
+    def _stream(self, query: TopMessage, kind: type[M], stream: _Stream, parameters: str = "") -> Iterator[M]:
+        left_s = max(0.0, stream.asked_s + stream.timeout_s - time.monotonic())
+        key = self.keys.service(stream.service, stream.unit)
+        replies = self.bus.query(key, encode(query), encoding(query), parameters=parameters, timeout_s=left_s)
         # A generator of its own: the question is on its way before the first answer is asked for.
-        return self._open(replies, kind, _Stream(_SERVED_BY[service], unit, asked_s, timeout_s, expected))
+        return self._open(replies, kind, stream)
 
     def _open(self, replies: Iterator[Sample], kind: type[M], stream: _Stream) -> Iterator[M]:
         counts: Counter[str] = Counter()

@@ -60,6 +60,7 @@ class UnitRecord(Message):
     unit_number: Annotated[int, Field(ge=0, le=4095)]
     boot_id: BootId
     first_track_number: Annotated[int, Field(ge=0, lt=2**41)]
+    inputs: list[Id] = []
     settings: dict[str, Any]
     registration: RegistrationRecord | None = None
     state: str | None = None

@@ -68,6 +68,10 @@ class Keys:
         """Liveliness token of a sensor or service."""
         return self._key("live", kind, ident)
 
+    def asking(self, request_id: str) -> str:
+        """Liveliness token of whoever waits for the answer to a long question; with it the question is given up."""
+        return self._key("asking", request_id)
+
     def status(self, kind: str, ident: str) -> str:
         """Where a service publishes how it is."""
         return self._key("status", kind, ident)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from typing import Self, TypeVar
 
 from trackmesh.protocol.buffer import Buffer
-from trackmesh.protocol.bus import AliveEvent, Query, QueryHandler, Sample
+from trackmesh.protocol.bus import WAITING, AliveEvent, Query, QueryHandler, Sample
 from trackmesh.protocol.errors import BusError
 from trackmesh.protocol.keys import matches, parse_parameters
 from trackmesh.protocol.serving import Job, QueryPool
@@ -107,9 +107,9 @@ class _MemoryPublisher(_Declared):
 
 
 class _Server(_Declared):
-    def __init__(self, hub: MemoryHub, key: str, handler: QueryHandler, workers: int) -> None:
+    def __init__(self, hub: MemoryHub, key: str, handler: QueryHandler, workers: int, waiting: int) -> None:
         self.key = key
-        self.pool = QueryPool(handler, workers)
+        self.pool = QueryPool(handler, workers, waiting)
         super().__init__(hub, hub.servers)
 
     def close(self) -> None:
@@ -175,9 +175,9 @@ class MemoryBus:
             server.pool.submit(_job(question, replies))
         return _replies(replies, len(servers), deadline)
 
-    def serve(self, key: str, handler: QueryHandler, *, workers: int = 2) -> _Server:
+    def serve(self, key: str, handler: QueryHandler, *, workers: int = 2, waiting: int = WAITING) -> _Server:
         """See ``Bus.serve``."""
-        return self._mine(_Server(self._open_hub(), key, handler, workers))
+        return self._mine(_Server(self._open_hub(), key, handler, workers, waiting))
 
     def declare_alive(self, key: str) -> _Token:
         """See ``Bus.declare_alive``."""

@@ -128,5 +128,8 @@ class TrackPicture:
         rows["unit"] = self._units.index(frame.unit_id)
         rows["t_ns"] = frame.t_ns
         rows["heard_s"] = self._clock()
-        rows["height_m"] = np.nan if frame.height_m is None else frame.height_m
+        rows["height_m"] = np.nan
+        known = frame.height_known()
+        if frame.height_m is not None:
+            rows["height_m"][known] = frame.height_m[known]
         return rows

@@ -17,7 +17,7 @@ from trackmesh.protocol.bus import Bus, Query
 from trackmesh.protocol.codec import answer, encode, encoding, end, refusal
 from trackmesh.protocol.errors import RefusedMessage
 from trackmesh.protocol.keys import Keys
-from trackmesh.protocol.messages import Envelope, PlotBatch, ScanPart, SensorInfo
+from trackmesh.protocol.messages import Envelope, Geodetic, PlotBatch, ScanPart, SensorInfo
 from trackmesh.protocol.serving import asked_format
 
 PLOT_HISTORY_S = 10.0
@@ -30,6 +30,39 @@ _MOST_HISTORY = 4096
 def plot_history(batches_per_s: float) -> int:
     """How many batches a sensor must keep to lose none in an outage of ``PLOT_HISTORY_S``."""
     return min(max(math.ceil(PLOT_HISTORY_S * batches_per_s), _LEAST_HISTORY), _MOST_HISTORY)
+
+
+class Presence:
+    """That a sensor is there: who it is, published and told to whoever asks, and that it is alive.
+
+    Args:
+        bus: a way into the network; it is not closed.
+        keys: of the realm.
+        info: who the sensor is.
+    """
+
+    def __init__(self, bus: Bus, keys: Keys, info: SensorInfo) -> None:
+        self.info = info
+        self._publisher = bus.publisher(keys.sensor(info.sensor_id), history=1)
+        self._server = bus.serve(keys.sensor(info.sensor_id), self._who, workers=1)
+        # First who it is, then that it is there: who hears of it can already know it.
+        self.announce(info)
+        self._token = bus.declare_alive(keys.live("sensor", info.sensor_id))
+
+    def announce(self, info: SensorInfo) -> None:
+        """Publish who the sensor is, when it has changed."""
+        self.info = info
+        self._publisher.put(encode(info), encoding(info))
+
+    def close(self) -> None:
+        """Be there no longer."""
+        for declared in (self._token, self._server, self._publisher):
+            declared.close()
+
+    def _who(self, query: Query) -> Iterator[tuple[bytes, str]]:
+        fmt = asked_format(query)
+        yield answer(self.info, fmt), encoding(Envelope, fmt)
+        yield end(1, fmt), encoding(Envelope, fmt)
 
 
 class SensorPublisher:
@@ -48,22 +81,21 @@ class SensorPublisher:
         self, bus: Bus, realm: str, info: SensorInfo, *, history: int | None = None, boot_id: str | None = None
     ) -> None:
         keys = Keys(realm)
-        self.info = info
         self.boot_id = boot_id or uuid.uuid4().hex[:16]
         self._seq = 0
         self._lock = threading.Lock()
-        self._info_publisher = bus.publisher(keys.sensor(info.sensor_id), history=1)
         kept = plot_history(1.0 / info.period_s) if history is None else history
         self._plots = bus.publisher(keys.plots(info.sensor_id), history=kept)
-        self._server = bus.serve(keys.sensor(info.sensor_id), self._who, workers=1)
-        # First who it is, then that it is there: who hears of it can already know it.
-        self.announce(info)
-        self._token = bus.declare_alive(keys.live("sensor", info.sensor_id))
+        self._presence = Presence(bus, keys, info)
+
+    @property
+    def info(self) -> SensorInfo:
+        """Who the sensor is."""
+        return self._presence.info
 
     def announce(self, info: SensorInfo) -> None:
         """Publish who the sensor is, when it has changed."""
-        self.info = info
-        self._info_publisher.put(encode(info), encoding(info))
+        self._presence.announce(info)
 
     def publish(
         self,
@@ -74,8 +106,14 @@ class SensorPublisher:
         variances: npt.ArrayLike | None = None,
         labels: Sequence[str] | None = None,
         scan: ScanPart | None = None,
+        site: Geodetic | None = None,
+        site_enu_m: Sequence[float] | None = None,
+        site_velocity_enu_mps: Sequence[float] | None = None,
     ) -> PlotBatch:
         """Publish the plots of a scan or sector, also when there are none; the batch as published.
+
+        A sensor that moves says where it stood, ``site`` or ``site_enu_m``, and if it measures range rates how it
+        moved.
 
         Raises:
             RefusedMessage: the plots are no valid ``PlotBatch``.
@@ -93,6 +131,9 @@ class SensorPublisher:
                     variances=None if variances is None else np.asarray(variances, np.float64),
                     labels=None if labels is None else list(labels),
                     scan=scan,
+                    site=site,
+                    site_enu_m=None if site_enu_m is None else list(site_enu_m),
+                    site_velocity_enu_mps=None if site_velocity_enu_mps is None else list(site_velocity_enu_mps),
                 )
             except ValidationError as error:
                 raise refusal("PlotBatch", error) from None
@@ -117,13 +158,8 @@ class SensorPublisher:
 
     def close(self) -> None:
         """Be alive no longer."""
-        for declared in (self._token, self._server, self._plots, self._info_publisher):
-            declared.close()
-
-    def _who(self, query: Query) -> Iterator[tuple[bytes, str]]:
-        fmt = asked_format(query)
-        yield answer(self.info, fmt), encoding(Envelope, fmt)
-        yield end(1, fmt), encoding(Envelope, fmt)
+        self._presence.close()
+        self._plots.close()
 
     def __enter__(self) -> Self:
         return self

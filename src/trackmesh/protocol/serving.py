@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple, TypeVar
 
-from trackmesh.protocol.bus import Query, QueryHandler
+from trackmesh.protocol.bus import WAITING, Query, QueryHandler
 from trackmesh.protocol.codec import MAX_BYTES, Format, answer, decode, encoding, end, failure
 from trackmesh.protocol.errors import BusError, QueryFailed, RefusedMessage
 from trackmesh.protocol.messages import Envelope
@@ -18,9 +18,6 @@ from trackmesh.protocol.messages.base import TopMessage
 M = TypeVar("M", bound=TopMessage)
 
 _log = logging.getLogger(__name__)
-
-WAITING = 64
-"""How many questions may wait for a worker; more are refused at once."""
 
 _NOTHING = b"\x80"
 
@@ -33,7 +30,7 @@ def asked_format(query: Query) -> Format:
 def answers(
     query: Query,
     kind: type[M],
-    handle: Callable[[M], Iterable[TopMessage]],
+    handle: Callable[[M], Iterable[TopMessage | bytes]],
     refuse: Callable[[str], None],
     *,
     max_bytes: int = MAX_BYTES,
@@ -46,7 +43,7 @@ def answers(
     Args:
         query: the question; an empty payload is a ``kind`` without any field.
         kind: the message the question must hold.
-        handle: gives the answers, each when it is ready.
+        handle: gives the answers, each when it is ready; bytes are one in its envelope already.
         refuse: called with the reason of a refusal, to count it.
         max_bytes: the largest question accepted.
     """
@@ -54,7 +51,7 @@ def answers(
     wrapped = encoding(Envelope, fmt)
     try:
         for message in handle(_question(query, kind, max_bytes)):
-            yield answer(message, fmt), wrapped
+            yield message if isinstance(message, bytes) else answer(message, fmt), wrapped
             done += 1
     except RefusedMessage as error:
         refuse(error.reason)

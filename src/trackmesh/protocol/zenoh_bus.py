@@ -22,7 +22,7 @@ import zenoh
 from zenoh import ext, handlers
 
 from trackmesh.protocol.buffer import Buffer
-from trackmesh.protocol.bus import AliveEvent, Query, QueryHandler, Sample
+from trackmesh.protocol.bus import WAITING, AliveEvent, Query, QueryHandler, Sample
 from trackmesh.protocol.errors import BusError
 from trackmesh.protocol.keys import parse_parameters
 from trackmesh.protocol.serving import Job, QueryPool
@@ -97,9 +97,9 @@ class _ZenohPublisher(_Declaration):
 class _Server(_Declaration):
     rank = _Rank.SERVER
 
-    def __init__(self, session: zenoh.Session, key: str, handler: QueryHandler, workers: int) -> None:
+    def __init__(self, session: zenoh.Session, key: str, handler: QueryHandler, workers: int, waiting: int) -> None:
         self._key = key
-        self._pool = QueryPool(handler, workers)
+        self._pool = QueryPool(handler, workers, waiting)
         super().__init__(session.declare_queryable(key, self._take))
 
     def _take(self, query: zenoh.Query) -> None:
@@ -253,9 +253,9 @@ class ZenohBus:
             raise BusError(f"The question to {expression} could not be sent: {error}.") from None
         return _replies(replies, cancel)
 
-    def serve(self, key: str, handler: QueryHandler, *, workers: int = 2) -> _Server:
+    def serve(self, key: str, handler: QueryHandler, *, workers: int = 2, waiting: int = WAITING) -> _Server:
         """See ``Bus.serve``."""
-        return self._declare(lambda session: _Server(session, key, handler, workers))
+        return self._declare(lambda session: _Server(session, key, handler, workers, waiting))
 
     def declare_alive(self, key: str) -> _Declaration:
         """See ``Bus.declare_alive``."""

@@ -1,7 +1,7 @@
-"""Simulated EMI scans: a coil carried over buried spheres and cylinders, with the truth beside the scans.
+"""Simulated EMI scans: coils carried over buried spheres and cylinders, with the truth beside the scans.
 
 The same arguments and seed give the same bytes. Fields are those of ``services.emi.fields``: a static primary field,
-targets that answer as dipoles, in-phase parts only.
+targets that answer as dipoles. Frequencies and gates are channels: see ``real_channels``.
 """
 
 from __future__ import annotations
@@ -10,11 +10,13 @@ from math import pi, radians
 from typing import Literal, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from trackmesh.protocol.arrays import FloatArray
 from trackmesh.protocol.messages import EmiGeometry, EmiOptions, EmiReceiver, EmiScanBatch, EmiTransmitter
-from trackmesh.services.emi.fields import primary_field, secondary_field, to_elements
+from trackmesh.services.emi.fields import MU0, primary_field, secondary_field, to_elements
 from trackmesh.services.emi.polarizability import cylinder, rotation, sphere, world_tensor
+from trackmesh.services.emi.sensor import rotations
 from trackmesh.sim.scenario import Emi
 
 OMEGA_RAD_S = 1000.0
@@ -105,16 +107,48 @@ def random_targets(
 
 
 def clean_field_nt(geometry: EmiGeometry, truth: Buried) -> FloatArray:
-    """Secondary field (B, 1, W, 3) in nT without noise."""
+    """Secondary field (B, 1, W, K) in nT without noise, in-phase part, one target a scan."""
+    scans = zip(truth.position_m, truth.tensor_m3, strict=True)
+    return np.stack([channel_field_nt(geometry, place, tensor[None]) for place, tensor in scans])
+
+
+def channel_field_nt(geometry: EmiGeometry, position_m: FloatArray, tensors_m3: FloatArray) -> FloatArray:
+    """Secondary field (C, W, K) in nT of one target at (3,) with a tensor (C, 3, 3) for each channel."""
     tx, positions = geometry.transmitter, geometry.positions_m
+    turn = np.broadcast_to(np.eye(3), (len(positions), 3, 3))
+    if geometry.attitude is not None:
+        turn = rotations(geometry.attitude)
     moment = tx.turns * tx.current_a * pi * tx.radius_m**2
-    radius = tx.radius_m if tx.model == "loop" else 0.0
-    field = np.empty((len(truth.position_m), 1, len(positions), 3))
-    for b, (place, tensor) in enumerate(zip(truth.position_m, truth.tensor_m3, strict=True)):
-        axis = np.array(tx.axis) if geometry.axes is None else geometry.axes
-        h, _ = primary_field(place - positions - tx.offset_m, axis, moment, radius)
-        field[b, 0] = 1e9 * secondary_field(positions + geometry.receiver.offset_m - place, h @ tensor)
-    return field if geometry.receiver.components == "xyz" else field[..., 2:]
+    axis = turn @ np.array(tx.axis) if geometry.axes is None else geometry.axes
+    to_target = position_m - positions - turn @ np.array(tx.offset_m)
+    h, _ = primary_field(to_target, axis, moment, tx.radius_m if tx.model == "loop" else 0.0)
+    dipoles = np.einsum("cij,wj->cwi", tensors_m3, h)
+    return np.concatenate(
+        [_received_nt(one, positions, turn, position_m, dipoles) for one in geometry.all_receivers], 2
+    )
+
+
+def _received_nt(
+    receiver: EmiReceiver, positions_m: FloatArray, turn: FloatArray, position_m: FloatArray, dipoles: FloatArray
+) -> FloatArray:
+    """Field (C, W, k) that one receiver measures of dipoles (C, W, 3) at a place."""
+    directions = np.eye(3) if receiver.components == "xyz" else np.eye(3)[2:]
+    if not isinstance(receiver.components, str):
+        directions = np.array(receiver.components)
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    axes = np.einsum("wij,kj->wki", turn, unit)
+    offset = positions_m + turn @ np.array(receiver.offset_m) - position_m
+    if receiver.radius_m == 0.0:
+        fields = np.stack([secondary_field(offset, m) for m in dipoles])
+        return np.asarray(1e9 * np.einsum("cwi,wki->cwk", fields, axes))
+    # Reciprocity: the mean field along a coil's axis is what the coil, driven with unit moment, does at the dipole.
+    driven = np.stack([primary_field(-offset, axes[:, k], 1.0, receiver.radius_m)[0] for k in range(len(unit))], 1)
+    return np.asarray(1e9 * MU0 * np.einsum("wki,cwi->cwk", driven, dipoles))
+
+
+def real_channels(tensors_m3: npt.NDArray[np.complex128]) -> FloatArray:
+    """Complex tensors (F, 3, 3), one a frequency, as channels (2 F, 3, 3): in-phase and quadrature in turn."""
+    return np.stack([tensors_m3.real, tensors_m3.imag], 1).reshape(-1, 3, 3)
 
 
 def simulate(

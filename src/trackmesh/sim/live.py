@@ -13,11 +13,16 @@ from collections.abc import Callable
 from trackmesh.protocol.bus import Bus
 from trackmesh.protocol.codec import encode, encoding
 from trackmesh.protocol.keys import Keys
+from trackmesh.protocol.ranging import RangePublisher
 from trackmesh.protocol.sensor import SensorPublisher, plot_history
 from trackmesh.sim.radar import radar_batches, sensor_info
 from trackmesh.sim.recording import TRUTH_PERIOD_S
 from trackmesh.sim.scenario import Scenario
+from trackmesh.sim.tags import TagWorld, reader_infos
 from trackmesh.sim.truth import World, truth_frame
+
+LATEST_NS = 1_000_000_000
+"""Tags that fell behind by more go on with the present."""
 
 LONGEST_WAIT_S = 1.0
 """The wall clock may be set while we wait; it is looked at again after this time."""
@@ -59,6 +64,40 @@ def run_radar(
                     break
                 sensor.publish_batch(batch)
                 sent += 1
+    return sent
+
+
+def run_tags(
+    bus: Bus,
+    scenario: Scenario,
+    seed: int,
+    start_ns: int,
+    stop: threading.Event,
+    *,
+    announce: bool = True,
+    keys: Keys | None = None,
+    boot_id: str | None = None,
+    clock: Clock = time.time_ns,
+) -> int:
+    """Publish what the readers of a scenario hear of its tags, tick by tick, until ``stop`` is set; how many batches.
+
+    Who fell behind by more than a second goes on with the present. Without ``announce`` the readers do not say where
+    they stand: a tag service has to know it from its file.
+
+    Raises:
+        ScenarioError: the scenario has no tags.
+    """
+    world, sent = TagWorld(scenario, seed), 0
+    tick_ns = round(world.tags.tick_s * 1e9)
+    infos = reader_infos(scenario) if announce else []
+    realm = (keys or Keys()).realm
+    tick = max(0, -((start_ns - clock()) // tick_ns))
+    with RangePublisher(bus, realm, world.tags.network_id, infos, boot_id=boot_id) as network:
+        while wait_until(start_ns + tick * tick_ns, stop, clock):
+            network.publish_batch(world.batch(tick, boot_id=network.boot_id, seq=sent, start_ns=start_ns))
+            sent += 1
+            behind = (clock() - start_ns) // tick_ns - tick
+            tick += behind if behind * tick_ns > LATEST_NS else 1
     return sent
 
 

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Iterator
-from itertools import takewhile
+from itertools import islice, takewhile
 from pathlib import Path
 
 from trackmesh.protocol.files import RecordWriter
 from trackmesh.protocol.messages import PlotBatch, TruthFrame
 from trackmesh.sim.radar import DueBatch, radar_batches, sensor_info
 from trackmesh.sim.scenario import Scenario
+from trackmesh.sim.tags import TagWorld, reader_infos
 from trackmesh.sim.truth import World, truth_frame
 
 START_NS = 1_735_689_600_000_000_000
@@ -82,3 +83,34 @@ def write_recording(
             for frame in recorded_truth(scenario, seed, duration_s=duration_s, start_ns=start_ns):
                 out.write(frame)
     return n_plots
+
+
+def write_ranges(
+    scenario: Scenario,
+    seed: int,
+    path_ranges: Path,
+    path_truth: Path | None = None,
+    *,
+    duration_s: float | None = None,
+    start_ns: int = START_NS,
+) -> int:
+    """Write RANGES.jsonl and, where wanted, TRUTH.jsonl of the tags; returns the number of ranges.
+
+    Raises:
+        TrackmeshError: the scenario has no tags, or a file cannot be written.
+    """
+    world = TagWorld(scenario, seed)
+    seconds = scenario.duration_s if duration_s is None else duration_s
+    n_ranges, ticks = 0, round(seconds / world.tags.tick_s) + 1
+    with RecordWriter(path_ranges) as out:
+        out.write(scenario.origin)
+        for info in reader_infos(scenario):
+            out.write(info)
+        for batch in islice(world.batches(boot_id=f"sim-{seed}", start_ns=start_ns), ticks):
+            out.write(batch)
+            n_ranges += len(batch.t_ns)
+    if path_truth is not None:
+        with RecordWriter(path_truth) as out:
+            for k in range(round(seconds / TRUTH_PERIOD_S) + 1):
+                out.write(world.truth_frame(k * TRUTH_PERIOD_S, start_ns))
+    return n_ranges

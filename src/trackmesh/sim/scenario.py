@@ -149,16 +149,69 @@ class Emi(_Section):
     targets: Annotated[tuple[EmiTarget, ...], Field(min_length=1)]
 
 
+class Rssi(_Section):
+    """Readers that tell signal strengths: power at a metre, exponent of its loss, noise of a reading."""
+
+    power_1m_dbm: Finite = -45.0
+    exponent: Positive = 2.5
+    noise_db: NonNegative = 3.0
+
+
+class TagReader(_Section):
+    """A reader of tags: its name and its place, east and north."""
+
+    id: Id
+    site_enu_m: tuple[Finite, Finite]
+
+
+class Tags(_Section):
+    """Tags that are carried along a path, and the readers that hear them now and then.
+
+    Each tag follows the same way through ``path_enu_m`` (a smooth curve, back and forth), turned or mirrored in its
+    square and at another time. ``stop_and_go`` is the share by which the speed swings, once in ``stop_and_go_s``; at
+    the ends of the way a tag slows down over ``turn_m``. At every tick each reader within ``max_range_m`` hears a tag
+    with probability ``p_detect``; a share ``nlos_share`` of the ranges goes round a corner and is longer by an
+    exponential of mean ``nlos_m``.
+    """
+
+    network_id: Id = "hall"
+    count: Annotated[int, Field(ge=1, le=100_000)] = 1
+    path_enu_m: Annotated[tuple[tuple[Finite, Finite], ...], Field(min_length=2)]
+    speed_mps: Positive
+    stop_and_go: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    stop_and_go_s: Positive = 13.0
+    turn_m: NonNegative = 8.0
+    tick_s: Positive = 0.1
+    max_range_m: Positive
+    p_detect: Annotated[float, Field(gt=0.0, le=1.0)]
+    sigma_range_m: Positive
+    nlos_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    nlos_m: Positive = 8.0
+    rssi: Rssi | None = None
+    readers: Annotated[tuple[TagReader, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _names_each_reader_once(self) -> Self:
+        ids = [reader.id for reader in self.readers]
+        if twice := sorted({name for name in ids if ids.count(name) > 1}):
+            raise ValueError(f"the reader id {twice[0]!r} is used more than once")
+        return self
+
+
 class Scenario(_Section):
-    """A whole simulated world; with a seed it says everything that happens in it."""
+    """A whole simulated world; with a seed it says everything that happens in it.
+
+    It holds targets and the radars that see them, tags with their readers, buried objects, or all of these.
+    """
 
     name: Id
     description: str = ""
     origin: Geodetic
     duration_s: Positive
-    targets: Targets
-    radars: Annotated[tuple[Radar, ...], Field(min_length=1)]
+    targets: Targets | None = None
+    radars: tuple[Radar, ...] = ()
     emi: Emi | None = None
+    tags: Tags | None = None
 
     @model_validator(mode="after")
     def _names_each_radar_once(self) -> Self:
@@ -166,6 +219,32 @@ class Scenario(_Section):
         if twice := sorted({name for name in ids if ids.count(name) > 1}):
             raise ValueError(f"the radar id {twice[0]!r} is used more than once")
         return self
+
+    @model_validator(mode="after")
+    def _holds_something(self) -> Self:
+        if (self.targets is None) != (not self.radars):
+            raise ValueError("targets need radars that see them, and radars need targets")
+        if self.targets is None and self.emi is None and self.tags is None:
+            raise ValueError("there must be targets with radars, tags or emi")
+        return self
+
+    def seen_targets(self) -> Targets:
+        """The targets of the radars.
+
+        Raises ScenarioError where the scenario has none.
+        """
+        if self.targets is None:
+            raise ScenarioError(f"the scenario {self.name!r} has no targets and no radars.")
+        return self.targets
+
+    def heard_tags(self) -> Tags:
+        """The tags.
+
+        Raises ScenarioError where the scenario has none.
+        """
+        if self.tags is None:
+            raise ScenarioError(f"The scenario {self.name!r} has no [tags] section.")
+        return self.tags
 
     def radar(self, radar_id: str) -> Radar:
         """The radar of that id.
@@ -175,7 +254,7 @@ class Scenario(_Section):
         for radar in self.radars:
             if radar.id == radar_id:
                 return radar
-        known = ", ".join(radar.id for radar in self.radars)
+        known = ", ".join(radar.id for radar in self.radars) or "none"
         raise ScenarioError(f"the scenario {self.name!r} has no radar {radar_id!r}; it has {known}.")
 
 

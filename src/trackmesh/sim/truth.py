@@ -80,7 +80,7 @@ class Truth:
 def make_truth(scenario: Scenario, seed: int, horizon_s: float | None = None) -> Truth:
     """The truth of a scenario up to ``horizon_s`` (the scenario's duration where None)."""
     horizon_s = scenario.duration_s if horizon_s is None else horizon_s
-    targets = scenario.targets
+    targets = scenario.seen_targets()
     streams = np.random.SeedSequence(seed, spawn_key=(TRUTH_STREAM,)).spawn(3)
     turning_rng, quiet_rng, life_rng = (np.random.default_rng(stream) for stream in streams)
     turning = turning_legs(targets, targets.count - targets.quiet_count, turning_rng, horizon_s)

@@ -9,9 +9,11 @@ from scipy.special import ive
 from trackmesh.services.emi.fields import MU0
 from trackmesh.services.emi.polarizability import (
     cylinder,
+    decay_roots,
     from_thesis_beta,
     rotation,
     sphere,
+    sphere_step_off,
     to_thesis_beta,
     world_tensor,
 )
@@ -70,3 +72,33 @@ def test_world_tensor_keeps_the_principal_values_and_the_axis(theta: float, phi:
     tensor = world_tensor([1.0, 1.0, 0.4], u)
     np.testing.assert_allclose(np.linalg.eigvalsh(tensor.real), [0.4, 1.0, 1.0], atol=1e-12)
     np.testing.assert_allclose(tensor @ u[:, 2], 0.4 * u[:, 2], atol=1e-12)
+
+
+@pytest.mark.parametrize("mu_r", [1.0, 5.0, 100.0])
+@pytest.mark.parametrize("omega", [0.3, 30.0, 3e3])
+def test_decay_and_frequency_response_are_one_function(mu_r: float, omega: float) -> None:
+    # The Laplace transform of the decay is (M(0) - M(s)) / s; the series can be transformed term by term.
+    tau_s = COPPER * MU0 * mu_r * A**2
+    x2 = decay_roots(mu_r, 20_000) ** 2
+    weight = 12.0 * np.pi * A**3 * mu_r / (x2 + (mu_r - 1.0) * (mu_r + 2.0))
+    transform = (weight / (x2 / tau_s + 1j * omega)).sum()
+    still = 4.0 * np.pi * A**3 * (mu_r - 1.0) / (mu_r + 2.0)
+    expected = (still - sphere(A, omega, COPPER, mu_r)) / (1j * omega)
+    assert abs(transform - expected) < 1e-3 * abs(expected)
+
+
+@pytest.mark.parametrize("mu_r", [1.0, 50.0])
+def test_decay_begins_at_the_change_of_the_field_and_has_its_rate(mu_r: float) -> None:
+    tau_s = COPPER * MU0 * mu_r * A**2
+    still = 4.0 * np.pi * A**3 * (mu_r - 1.0) / (mu_r + 2.0)
+    early = sphere_step_off(A, np.array([1e-8 * tau_s]), COPPER, mu_r)
+    assert early[0] == pytest.approx(still + 2.0 * np.pi * A**3, rel=0.02)
+    t = tau_s * np.array([0.01, 0.1])
+    step = 1e-5 * t
+    difference = (sphere_step_off(A, t - step, COPPER, mu_r) - sphere_step_off(A, t + step, COPPER, mu_r)) / (2 * step)
+    np.testing.assert_allclose(sphere_step_off(A, t, COPPER, mu_r, rate=True), difference, rtol=1e-6)
+
+
+def test_there_is_no_decay_before_the_field_is_off() -> None:
+    with pytest.raises(ValueError, match="after the field"):
+        sphere_step_off(A, np.array([0.0]), COPPER)

@@ -4,15 +4,19 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from tests.network.processes import wait_until
 
 from trackmesh.protocol.bus import Query
 from trackmesh.protocol.client import Client
 from trackmesh.protocol.codec import decode, encode, encoding
-from trackmesh.protocol.errors import QueryFailed
+from trackmesh.protocol.errors import QueryFailed, RefusedMessage
 from trackmesh.protocol.memory_bus import MemoryBus, MemoryHub
 from trackmesh.protocol.messages import EmiScanBatch, Envelope
-from trackmesh.services.emi.service import EmiService, start
-from trackmesh.services.emi.settings import EmiSettings
+from trackmesh.services.emi.service.geometries import Geometries
+from trackmesh.services.emi.service.handler import EmiService
+from trackmesh.services.emi.service.main import start
+from trackmesh.services.emi.service.pool import OwnWork
+from trackmesh.services.emi.service.settings import EmiSettings
 from trackmesh.services.runtime import ServiceRuntime
 from trackmesh.sim.emi import random_targets, simulate, survey_geometry
 
@@ -29,7 +33,7 @@ def run(hub: MemoryHub) -> Iterator[Run]:
     running: list[ServiceRuntime] = []
 
     def go(**options: object) -> ServiceRuntime:
-        settings = EmiSettings(**options)  # type: ignore[arg-type]
+        settings = EmiSettings(**({"processes": 0} | options))  # type: ignore[arg-type]
         runtime = ServiceRuntime("emi", settings, bus=MemoryBus(hub)).start()
         running.append(runtime)
         start(runtime, settings)
@@ -73,7 +77,19 @@ def test_a_broken_scan_in_a_batch_is_answered_as_such(run: Run, ask: Client, bat
     assert [results[i] for i in (0, 2, 3)] == [whole[i] for i in (0, 2, 3)]
 
 
-@pytest.mark.parametrize("limit", [{"max_samples": 100}, {"max_numbers": 1000}, {"max_request_bytes": 2000}])
+def test_one_bad_scan_of_many_leaves_the_others_bit_for_bit(run: Run, ask: Client) -> None:
+    run()
+    many = simulate(survey_geometry((2.0, 2.0), 0.2), random_targets(64, 3, spread_m=0.5), 30.0, 3).batch
+    field = many.field.copy()
+    field[17] = np.nan
+    whole = {r.index: r for r in ask.invert(many)}
+    broken = {r.index: r for r in ask.invert(many.model_copy(update={"field": field}))}
+    assert broken.pop(17).status == "invalid"
+    assert all(encode(result) == encode(whole[i]) for i, result in broken.items())
+    assert len(broken) == 63
+
+
+@pytest.mark.parametrize("limit", [{"max_numbers": 1000}, {"max_request_bytes": 2000}])
 def test_too_large_a_request_is_refused(run: Run, ask: Client, batch: EmiScanBatch, limit: dict[str, int]) -> None:
     runtime = run(**limit)
     with pytest.raises(QueryFailed, match=r"at most \d+ are accepted") as caught:
@@ -82,17 +98,81 @@ def test_too_large_a_request_is_refused(run: Run, ask: Client, batch: EmiScanBat
     assert runtime.counters.refused() == {"too_large": 1}
 
 
-def test_a_request_that_takes_too_long_is_given_up(run: Run, ask: Client, batch: EmiScanBatch) -> None:
-    runtime = run(request_deadline_s=1e-9)
-    with pytest.raises(QueryFailed, match="given up"):
-        list(ask.invert(batch))
-    assert runtime.counters.refused() == {"deadline": 1}
+def test_too_large_a_scan_is_answered_as_such(run: Run, ask: Client, batch: EmiScanBatch) -> None:
+    runtime = run(max_samples=100)
+    results = list(ask.invert(batch))
+    assert [(r.index, r.status, r.reasons, r.targets) for r in results] == [
+        (i, "too_large", ["more_than_100_samples"], []) for i in range(4)
+    ]
+    assert runtime.counters.counts()["scans_too_large"] == 4
+
+
+def test_scans_not_done_at_the_deadline_are_told(run: Run, ask: Client, batch: EmiScanBatch) -> None:
+    run(request_deadline_s=1e-9)
+    results = list(ask.invert(batch))
+    assert [(r.status, r.reasons) for r in results] == [("too_large", ["deadline"])] * 4
+
+
+def test_a_geometry_may_be_named_once_it_is_known(run: Run, batch: EmiScanBatch) -> None:
+    runtime = run()
+    service = EmiService(runtime, EmiSettings(), OwnWork())
+    assert batch.geometry is not None
+    ident = batch.geometry.content_id()
+    named = batch.model_copy(update={"geometry": None, "geometry_id": ident})
+
+    def answered(question: EmiScanBatch) -> list[Envelope]:
+        query = Query("key", {}, encode(question), encoding(question))
+        return [decode(p, Envelope, e) for p, e in service.handle(query)]
+
+    assert answered(named)[0].code == "unknown_geometry"
+    whole = answered(batch)
+    assert answered(named) == whole
+    payload = whole[0].payload
+    assert payload is not None and (payload["geometry_id"], payload["unit_id"]) == (ident, "main")
+    assert answered(batch.model_copy(update={"geometry_id": "other"}))[0].code == "invalid"
+    short = named.model_copy(update={"field": batch.field[:, :, :-1]})
+    assert answered(short)[0].code == "wrong_length"
+
+
+def test_forgotten_geometries_are_those_not_used(batch: EmiScanBatch) -> None:
+    known = Geometries(2)
+    batches = []
+    for k in range(3):
+        geometry = survey_geometry((4.0, 4.0), 0.2, height_m=0.1 * k)
+        batches.append(batch.model_copy(update={"geometry": geometry}))
+    idents = [known.resolve(one)[0] for one in (*batches[:2], batches[0], batches[2])]
+    named = [batch.model_copy(update={"geometry": None, "geometry_id": ident}) for ident in idents]
+    assert known.resolve(named[0])[1] == batches[0].geometry
+    with pytest.raises(RefusedMessage, match="not known here"):
+        known.resolve(named[1])
+
+
+def test_what_nobody_waits_for_is_given_up(run: Run, hub: MemoryHub, batch: EmiScanBatch) -> None:
+    runtime = run()
+    service = EmiService(runtime, EmiSettings(), OwnWork())
+    many = batch.model_copy(update={"field": np.repeat(batch.field, 30, axis=0)})
+    answer = service.handle(Query("key", {"asking": "me"}, encode(many), encoding(many)))
+    next(answer)
+    assert service.askers.left("me") == 1
+    kinds = [decode(p, Envelope, e) for p, e in answer]
+    assert [(e.kind, e.code) for e in kinds[-2:]] == [("error", "cancelled"), ("end", None)]
+    assert len(kinds) < 100
+    assert service.askers.left("me") == 0
+
+
+def test_a_client_that_cancels_ends_the_work(run: Run, ask: Client, batch: EmiScanBatch) -> None:
+    runtime = run()
+    many = batch.model_copy(update={"field": np.repeat(batch.field, 200, axis=0)})
+    with ask.invert(many) as inversion:
+        next(inversion)
+    wait_until(lambda: runtime.counters.refused().get("cancelled"), "the work is given up")
+    assert runtime.counters.counts()["scans"] < 800
 
 
 @pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x80", encode(Envelope(kind="end", count=0))])
 def test_rubbish_is_refused_with_a_sentence(run: Run, payload: bytes) -> None:
     runtime = run()
-    service = EmiService(runtime, EmiSettings())
+    service = EmiService(runtime, EmiSettings(), OwnWork())
     replies = [decode(p, Envelope, e) for p, e in service.handle(Query("key", {}, payload, ""))]
     assert [r.kind for r in replies] == ["error", "end"]
     assert replies[0].detail
@@ -101,7 +181,7 @@ def test_rubbish_is_refused_with_a_sentence(run: Run, payload: bytes) -> None:
 
 def test_json_is_answered_in_json(run: Run, batch: EmiScanBatch) -> None:
     runtime = run()
-    service = EmiService(runtime, EmiSettings())
+    service = EmiService(runtime, EmiSettings(), OwnWork())
     one = batch.model_copy(update={"field": batch.field[:1]})
     query = Query("key", {"fmt": "json"}, encode(one, "json"), encoding(one, "json"))
     first, last = service.handle(query)
@@ -112,7 +192,7 @@ def test_json_is_answered_in_json(run: Run, batch: EmiScanBatch) -> None:
 
 def test_a_stopping_service_ends_its_answer(run: Run, batch: EmiScanBatch) -> None:
     runtime = run()
-    service = EmiService(runtime, EmiSettings())
+    service = EmiService(runtime, EmiSettings(), OwnWork())
     answer = service.handle(Query("key", {}, encode(batch), encoding(batch)))
     next(answer)
     runtime.stopping.set()

@@ -3,57 +3,29 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from tests.services.emi.makers import ATTITUDES, TENSOR, coils, field_t, ground
 
-from trackmesh.services.emi.design import (
-    Sensor,
-    background_levels,
-    gram_matrices,
-    reduce_background,
-    residuals,
-    solve_spd,
-)
-from trackmesh.services.emi.engine import XYZ, Z_ONLY, Background, Coils, Options, search_bounds, sensor_arrays
-from trackmesh.services.emi.fields import from_elements, primary_field, secondary_field, to_elements
-from trackmesh.services.emi.fit import Data, Enough, Fit, fit_target
+from trackmesh.services.emi.design import gram_matrices, model_field, response_rows
+from trackmesh.services.emi.elimination import background_levels, reduce_background, solve_spd
+from trackmesh.services.emi.estimators import Enough, Fit, Task
+from trackmesh.services.emi.estimators.fit import varpro
+from trackmesh.services.emi.fields import from_elements, to_elements
 from trackmesh.services.emi.kernels import FloatArray
 from trackmesh.services.emi.polarizability import rotation, world_tensor
-from trackmesh.services.emi.varpro import evaluate, linear_part
-from trackmesh.sim.emi import grid_positions
+from trackmesh.services.emi.sensor import XYZ, Z_ONLY, Background, Coils, Receiver, Sensor, sensor_arrays
+from trackmesh.services.emi.varpro import Prior, Stop, evaluate, linear_part, search
 
-MOMENT = 20.0 * np.pi * 0.25
-TENSOR = world_tensor([-0.098, -0.098, -0.044], rotation(0.0, np.pi / 4, np.pi / 4)).real
-ATTITUDES = [(0, 0), (30, 0), (45, 45), (90, 0), (0, 90), (75, -30)]
-
-
-def coils(is_loop: bool = True, n: int = 21, spacing_m: float = 0.2) -> Coils:
-    side = (n - 1) * spacing_m
-    return Coils(grid_positions((side, side), spacing_m), 0.5, MOMENT, is_loop)
-
-
-def field(c: Coils, r: FloatArray, tensor: FloatArray) -> FloatArray:
-    """(1, W, K) in T, by the public field functions."""
-    place = np.asarray(r, np.float64)
-    h, _ = primary_field(
-        place - c.positions_m - c.tx_offset_m, c.tx_axis, c.moment_am2, c.radius_m if c.is_loop else 0.0
-    )
-    b = secondary_field(c.positions_m + c.rx_offset_m - place, h @ tensor)
-    return np.asarray((b @ c.components.T)[None])
+EXACT = Enough(0.0, 0.01, 0.0, 0.0)
 
 
 def fit(c: Coils, y: FloatArray, background: Background = "const", robust: bool = True) -> Fit:
-    sensor = sensor_arrays(c, background)
     w = np.full(y.shape, 1.0 / np.abs(y).max())
-    return fit_target(
-        Data(sensor, y, w, search_bounds(sensor.place_m, Options()), 2.0), robust, Enough(0.0, 0.01, 0.0, 0.0)
-    )
+    return varpro(Task(sensor_arrays(c, background), y, w, ground(), EXACT, robust))
 
 
-def design(sensor: Sensor, r: FloatArray, tensor: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
-    """Rows of A (C W K, 6) and the model (C, W, K) by way of the residuals of a zero field."""
-    zero, one = np.zeros((1, n, len(sensor.components))), np.ones((1, n, len(sensor.components)))
-    levels = np.zeros((1, len(sensor.components), sensor.basis.shape[1]))
-    columns = [-residuals(sensor, zero, one, r, np.eye(6)[[a]], levels).ravel() for a in range(6)]
-    return np.stack(columns, 1), -residuals(sensor, zero, one, r, tensor, levels)
+def model(sensor: Sensor, r: FloatArray, tensor: FloatArray) -> FloatArray:
+    levels = np.zeros((1, sensor.direction.shape[1], sensor.basis.shape[1]))
+    return model_field(sensor, r[None], tensor[:, None], levels)[0]
 
 
 @pytest.mark.parametrize("attitude", ATTITUDES)
@@ -64,9 +36,9 @@ def test_noise_free_target_is_found_exactly(
 ) -> None:
     tensor = world_tensor([-0.098, -0.098, -0.044], rotation(0.0, *np.deg2rad(attitude))).real
     c = coils(is_loop)
-    found = fit(c, field(c, np.array(place), tensor))
-    assert np.abs(found.r_m - place).max() < 1e-6
-    np.testing.assert_allclose(found.tensor_m3[0], to_elements(tensor), atol=1e-6)
+    found = fit(c, field_t(c, np.array(place), tensor))
+    assert np.abs(found.r_m[0] - place).max() < 1e-6
+    np.testing.assert_allclose(found.tensor_m3[0, 0], to_elements(tensor), atol=1e-6)
     assert found.converged
 
 
@@ -76,71 +48,84 @@ def test_offset_tilted_and_scalar_sensors_are_modelled() -> None:
     tilted = c._replace(
         tx_axis=np.array([0.0, 0.0, 1.0]) + 0.2 * rng.normal(size=c.positions_m.shape),
         tx_offset_m=np.array([0.2, 0.0, 0.1]),
-        rx_offset_m=np.array([-0.3, 0.1, 0.0]),
+        receivers=(Receiver(XYZ, np.array([-0.3, 0.1, 0.0])),),
     )
     tilted = tilted._replace(tx_axis=tilted.tx_axis / np.linalg.norm(tilted.tx_axis, axis=1, keepdims=True))
     place = np.array([0.4, -0.3, -0.9])
-    for sensor in (tilted, c._replace(components=Z_ONLY), c._replace(components=XYZ[:2])):
-        found = fit(sensor, field(sensor, place, TENSOR))
-        np.testing.assert_allclose(found.r_m, place, atol=1e-6)
+    for c_ in (tilted, c._replace(receivers=(Receiver(Z_ONLY),)), c._replace(receivers=(Receiver(XYZ[:2]),))):
+        found = fit(c_, field_t(c_, place, TENSOR))
+        np.testing.assert_allclose(found.r_m[0], place, atol=1e-6)
 
 
 def test_channels_share_the_position_and_keep_their_own_tensors() -> None:
     c, place = coils(n=15), np.array([0.2, 0.1, -1.0])
-    y = np.concatenate([field(c, place, TENSOR), field(c, place, np.diag([0.01, 0.02, -0.03]))])
+    y = np.concatenate([field_t(c, place, TENSOR), field_t(c, place, np.diag([0.01, 0.02, -0.03]))])
     found = fit(c, y)
-    np.testing.assert_allclose(found.r_m, place, atol=1e-6)
-    np.testing.assert_allclose(found.tensor_m3[0], to_elements(TENSOR), atol=1e-7)
-    np.testing.assert_allclose(found.tensor_m3[1], [0.01, 0.02, -0.03, 0, 0, 0], atol=1e-7)
+    np.testing.assert_allclose(found.r_m[0], place, atol=1e-6)
+    np.testing.assert_allclose(found.tensor_m3[0, 0], to_elements(TENSOR), atol=1e-7)
+    np.testing.assert_allclose(found.tensor_m3[1, 0], [0.01, 0.02, -0.03, 0, 0, 0], atol=1e-7)
 
 
 def test_dipole_model_of_a_loop_has_the_known_bias_and_the_loop_model_none() -> None:
     place, loop = np.array([0.0, 0.0, -1.0]), coils(n=41, spacing_m=0.1)
     standing, ball = np.diag([-0.098, -0.098, -0.044]), -0.048 * np.eye(3)
     for tensor, bias_m, share in ((standing, 0.196, 0.73), (ball, 0.238, 1.01)):
-        y = field(loop, place, tensor)
+        y = field_t(loop, place, tensor)
         wrong = fit(loop._replace(is_loop=False), y, "none", robust=False)
-        assert place[2] - wrong.r_m[2] == pytest.approx(bias_m, abs=0.003)
-        error = np.linalg.norm(from_elements(wrong.tensor_m3[0]) - tensor) / np.linalg.norm(tensor)
+        assert place[2] - wrong.r_m[0, 2] == pytest.approx(bias_m, abs=0.003)
+        error = np.linalg.norm(from_elements(wrong.tensor_m3[0, 0]) - tensor) / np.linalg.norm(tensor)
         assert error == pytest.approx(share, abs=0.02)
-        assert np.abs(fit(loop, y, "none").r_m - place).max() < 1e-6
+        assert np.abs(fit(loop, y, "none").r_m[0] - place).max() < 1e-6
 
 
-@pytest.mark.parametrize("is_loop", [True, False])
-def test_jacobian_is_the_derivative_of_the_model(is_loop: bool) -> None:
-    c = coils(is_loop, n=7, spacing_m=0.4)
+@pytest.mark.parametrize(("is_loop", "rx_radius_m"), [(True, 0.0), (False, 0.0), (True, 0.3)])
+def test_jacobian_is_the_derivative_of_the_model(is_loop: bool, rx_radius_m: float) -> None:
+    c = coils(is_loop, n=7, spacing_m=0.4)._replace(receivers=(Receiver(XYZ, np.array([0.1, 0.2, 0.0]), rx_radius_m),))
     sensor, r, elements = sensor_arrays(c, "none"), np.array([0.1, -0.2, -0.8]), to_elements(TENSOR)[None]
     shape = (1, len(c.positions_m), 3)
     rng = np.random.default_rng(3)
     step = 1e-3
     for j in range(3):
         e = step * np.eye(3)[j]
-        h = {k: design(sensor, r + k * e, elements, shape[1])[1] for k in (-3, -2, -1, 1, 2, 3)}
+        h = {k: model(sensor, r + k * e, elements) for k in (-3, -2, -1, 1, 2, 3)}
         derivative = (45 * (h[1] - h[-1]) - 9 * (h[2] - h[-2]) + (h[3] - h[-3])) / (60 * step)
         # The Gram matrix holds D^T y for any y.
         y = rng.normal(size=shape)
-        gram = gram_matrices(sensor, y, np.ones(shape), np.arange(shape[1]), r, elements)
-        assert gram[0, :, 6 + j, 9].sum() == pytest.approx(float((derivative * y).sum()), rel=1e-7)
+        gram = gram_matrices(sensor, y, np.ones(shape), np.arange(shape[1]), r[None], elements[:, None])
+        largest = np.linalg.norm(derivative) * np.linalg.norm(y)
+        assert abs(gram[0, :, 6 + j, 9].sum() - float((derivative * y).sum())) < 1e-8 * largest
 
 
 def test_background_elimination_is_least_squares_with_explicit_columns() -> None:
     c = coils(n=9, spacing_m=0.4)
-    sensor, r = sensor_arrays(c, "plane"), np.array([0.1, -0.2, -0.8])
+    sensor, r = sensor_arrays(c, "plane"), np.array([[0.1, -0.2, -0.8]])
     n = len(c.positions_m)
     rng = np.random.default_rng(5)
     y, w = rng.normal(size=(1, n, 3)), rng.uniform(0.5, 2.0, (1, n, 3))
-    A, _ = design(sensor, r, np.zeros((1, 6)), n)
     explicit = np.zeros((n, 3, 9))
     for k in range(3):
         explicit[:, k, 3 * k : 3 * k + 3] = sensor.basis
-    columns = np.hstack([1e9 * A, explicit.reshape(-1, 9)]) * w.reshape(-1, 1)
+    columns = np.hstack([1e9 * response_rows(sensor, r).reshape(-1, 6), explicit.reshape(-1, 9)]) * w.reshape(-1, 1)
     x, rss, rank, _ = np.linalg.lstsq(columns, (w * y).ravel())
-    gram = gram_matrices(sensor, y, w, np.arange(n), r, np.zeros((1, 6)))
+    gram = gram_matrices(sensor, y, w, np.arange(n), r, np.zeros((1, 1, 6)))
     tensor, _, ours = linear_part(reduce_background(gram, 3))
     assert rank == 15
     assert ours == pytest.approx(rss[0], rel=1e-10)
-    np.testing.assert_allclose(tensor[0], 1e9 * x[:6], rtol=1e-8)
+    np.testing.assert_allclose(tensor[0, 0], 1e9 * x[:6], rtol=1e-8)
     np.testing.assert_allclose(background_levels(gram, 3, tensor)[0].ravel(), x[6:], rtol=1e-7)
+
+
+def test_columns_of_two_targets_are_those_of_each() -> None:
+    c = coils(n=9, spacing_m=0.4)
+    sensor, n = sensor_arrays(c, "const"), len(c.positions_m)
+    rng = np.random.default_rng(6)
+    y, w = rng.normal(size=(2, n, 3)), rng.uniform(0.5, 2.0, (2, n, 3))
+    r, tensor = np.array([[0.1, -0.2, -0.8], [-0.5, 0.3, -0.6]]), rng.normal(size=(2, 2, 6))
+    both = gram_matrices(sensor, y, w, np.arange(n), r, tensor)
+    for t in range(2):
+        own = [0, *range(1 + 6 * t, 7 + 6 * t), *range(13 + 3 * t, 16 + 3 * t), 19]
+        one = gram_matrices(sensor, y, w, np.arange(n), r[t : t + 1].copy(), tensor[:, t : t + 1].copy())
+        np.testing.assert_allclose(both[:, :, own][:, :, :, own], one, rtol=1e-10)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -148,8 +133,10 @@ def test_any_two_positions_leave_one_tensor_element_open(seed: int) -> None:
     rng = np.random.default_rng(seed)
     positions = np.column_stack([rng.uniform(-2, 2, (5, 2)), np.zeros(5)])
     for n, rank in ((2, 5), (5, 6)):
-        sensor = sensor_arrays(Coils(positions[:n], 0.5, MOMENT), "none")
-        A, _ = design(sensor, np.array([0.1, 0.2, -1.0]), np.zeros((1, 6)), n)
+        A = response_rows(
+            sensor_arrays(coils()._replace(positions_m=positions[:n]), "none"), np.array([[0.1, 0.2, -1.0]])
+        )
+        A = A.reshape(-1, 6)
         s = np.linalg.svd(A / np.linalg.norm(A, axis=0), compute_uv=False)
         assert (s > 1e-10).sum() == rank
 
@@ -157,21 +144,56 @@ def test_any_two_positions_leave_one_tensor_element_open(seed: int) -> None:
 @pytest.mark.parametrize("is_loop", [True, False])
 def test_scipy_finds_the_same_minimum(is_loop: bool) -> None:
     c, place = coils(is_loop), np.array([0.3, -0.2, -0.9])
-    y = field(c, place, TENSOR)
+    y = field_t(c, place, TENSOR)
     y = y + 0.1 * np.sqrt((y**2).mean()) * np.random.default_rng(7).normal(size=y.shape)
     sensor, unit = sensor_arrays(c, "const"), float(np.abs(y).max())
-    everywhere = search_bounds(sensor.place_m, Options())
-    w = np.full(y.shape, 1.0 / unit)
-    ours = fit_target(Data(sensor, y, w, everywhere, 1e3), False, Enough(0.0, 0.1, 0.0, 0.0))
+    w, every = np.full(y.shape, 1.0 / unit), np.arange(y.shape[1])
+    # A window of all samples, so that both minimise over the same.
+    start = np.array([[0.2, -0.1, -0.8]])
+    first, _, _ = linear_part(evaluate(sensor, y, w, every, start, np.zeros((1, 1, 6))))
+    ours = search(sensor, y, w, every, start, first, ground(), Stop(1e-9, 1e-12, 50))
 
     def misfit(x: FloatArray) -> FloatArray:
-        levels = unit * x[9:].reshape(1, 3, 1)
-        return np.asarray(residuals(sensor, y, w, x[:3], x[None, 3:9] / 10.0, levels).ravel())
+        signal, beneath = model_field(sensor, x[None, :3], x[None, None, 3:9] / 10.0, unit * x[9:].reshape(1, 3, 1))
+        return np.asarray((w * (y - signal - beneath)).ravel())
 
-    start = np.concatenate([place + 0.05, 10.0 * ours.tensor_m3[0], np.zeros(3)])
-    theirs = least_squares(misfit, start, method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14)
-    np.testing.assert_allclose(ours.r_m, theirs.x[:3], atol=3e-7)
-    np.testing.assert_allclose(ours.tensor_m3[0], theirs.x[3:9] / 10.0, atol=1e-6)
+    begin = np.concatenate([place + 0.05, 10.0 * ours.tensor_m3[0, 0], np.zeros(3)])
+    theirs = least_squares(misfit, begin, method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    np.testing.assert_allclose(ours.r_m[0], theirs.x[:3], atol=3e-7)
+    np.testing.assert_allclose(ours.tensor_m3[0, 0], theirs.x[3:9] / 10.0, atol=1e-6)
+
+
+def test_a_prior_weighs_as_much_as_it_knows() -> None:
+    c, place = coils(n=9, spacing_m=0.4), np.array([0.3, -0.2, -0.9])
+    y = field_t(c, place, TENSOR)
+    sigma = 0.1 * float(np.abs(y).max())
+    y = y + sigma * np.random.default_rng(7).normal(size=y.shape)
+    sensor, w, every = sensor_arrays(c, "none"), np.full(y.shape, 1.0 / sigma), np.arange(y.shape[1])
+    start, nothing = place[None].copy(), np.zeros((1, 1, 6))
+    tensor, _, _ = linear_part(evaluate(sensor, y, w, every, start, nothing))
+    mean, stop = place + np.array([0.05, 0.0, 0.1]), Stop(1e-9, 1e-12, 50)
+    found = {}
+    for sd in (1e-4, 1e4):
+        prior = Prior(mean, np.eye(3) / sd**2)
+        found[sd] = search(sensor, y, w, every, start, tensor, ground(prior=prior, sigma_known=True), stop).r_m[0]
+    free = search(sensor, y, w, every, start, tensor, ground(), stop).r_m[0]
+    np.testing.assert_allclose(found[1e-4], mean, atol=1e-5)
+    np.testing.assert_allclose(found[1e4], free, atol=1e-6)
+
+
+def test_a_prior_is_the_same_with_noise_that_is_known_and_that_is_estimated() -> None:
+    c, place = coils(), np.array([0.3, -0.2, -0.9])
+    y = field_t(c, place, TENSOR)
+    sigma = 0.5 * float(np.sqrt((y**2).mean()))
+    y = y + sigma * np.random.default_rng(8).normal(size=y.shape)
+    sensor, every, start = sensor_arrays(c, "none"), np.arange(y.shape[1]), place[None].copy()
+    prior, found = Prior(place + 0.05, np.eye(3) / 0.01**2), []
+    for known, unit in ((True, sigma), (False, 7.0 * sigma)):
+        w = np.full(y.shape, 1.0 / unit)
+        tensor, _, _ = linear_part(evaluate(sensor, y, w, every, start, np.zeros((1, 1, 6))))
+        here = ground(prior=prior, sigma_known=known)
+        found.append(search(sensor, y, w, every, start, tensor, here, Stop(1e-9, 1e-12, 50)).r_m[0])
+    np.testing.assert_allclose(found[0], found[1], atol=2e-4)
 
 
 def test_solve_scales_and_survives_a_missing_direction() -> None:
@@ -189,7 +211,7 @@ def test_solve_scales_and_survives_a_missing_direction() -> None:
 
 def test_weights_of_zero_are_absent_samples() -> None:
     c = coils(n=9, spacing_m=0.4)
-    sensor, r, tensor = sensor_arrays(c, "const"), np.array([0.0, 0.1, -0.9]), to_elements(TENSOR)[None]
+    sensor, r, tensor = sensor_arrays(c, "const"), np.array([[0.0, 0.1, -0.9]]), to_elements(TENSOR)[None, None]
     y = np.random.default_rng(2).normal(size=(1, 81, 3))
     w = np.ones_like(y)
     w[:, ::2] = 0.0

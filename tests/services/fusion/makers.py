@@ -208,7 +208,7 @@ def look(t_s: float, **change: Any) -> Look:
     """A whole look of a radar at the middle of the plane."""
     known = Look(
         sensor=0, t_s=t_s, site=np.zeros(2), max_range_m=120e3, period_s=4.0, p_detect=0.9, whole=True, margin_s=0.0,
-        lately_s=np.inf, clutter_density=1e-9, reference_density=1e-9,
+        lately_s=np.inf, clutter_density=np.array(1e-9), reference_density=1e-9,
     )  # fmt: skip
     return known._replace(**change)
 

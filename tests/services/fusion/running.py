@@ -29,8 +29,8 @@ class Running:
         sent: batches put so far, whatever they were.
     """
 
-    def __init__(self, clock: Literal["wall", "data"], **settings: Any) -> None:
-        hub = MemoryHub()
+    def __init__(self, clock: Literal["wall", "data"], *, hub: MemoryHub | None = None, **settings: Any) -> None:
+        hub = hub or MemoryHub()
         given = FusionSettings(realm="test", clock=clock, **settings)
         self.bus = MemoryBus(hub)
         self.client = Client(self.bus, "test")

@@ -199,3 +199,40 @@ def test_time_offsets_are_learnt_where_one_clock_is_right() -> None:
             assert told[1].time_offset_s == pytest.approx(-0.6, abs=0.15)
             assert 0.0 < told[1].time_offset_sigma_s < 0.1
     assert errors[0.5] < 0.75 * errors[0.0]
+
+
+# --- a sensor that moves ---
+
+
+def test_what_was_counted_stays_where_it_was_when_the_sensor_moves() -> None:
+    clutter = looked(Clutter(SITE, RANGE_M, None, True), 40, 20.0, 3, patch=10)
+    patch, other = SITE + np.array([40e3, 0.0]), SITE + np.array([-20e3, 10e3])
+    before = clutter.at(plots_at(np.stack([patch, other])), 1.0)
+    for k in range(1, 51):
+        clutter.follow(SITE + k * np.array([700.0, -300.0]))
+    after = clutter.at(plots_at(np.stack([patch, other])), 1.0)
+    assert after[0] > 0.3 * before[0]
+    assert after[0] > 10.0 * after[1]
+    clutter.follow(SITE + np.array([5e5, 0.0]))
+    gone = clutter.at(plots_at(np.stack([patch, patch + np.array([5e5, 0.0])])), 1.0)
+    assert gone[0] < clutter.whole() and gone[1] < clutter.whole()
+
+
+def test_where_no_areas_are_kept_nothing_has_to_follow() -> None:
+    clutter = looked(Clutter(SITE, RANGE_M, None, False), 10, 20.0, 3)
+    before = clutter.whole()
+    clutter.follow(SITE + 1e5)
+    assert clutter.at(plots_at(SITE[None]), 1.0)[0] == before
+
+
+@pytest.mark.parametrize(("step", "kept"), [((1, 0), 23 * 24), ((-3, 5), 21 * 19), ((30, 0), 0), ((0, 0), 24 * 24)])
+def test_cells_that_are_still_covered_are_kept(step: tuple[int, int], kept: int) -> None:
+    clutter = Clutter(SITE, 12e3, None, True)
+    clutter.restore(clutter.kept() | {"cells": 1.0 + np.arange(24.0 * 24.0).reshape(24, 24)})
+    clutter.follow(SITE + 1e3 * np.array(step))
+    after = clutter.kept()
+    assert (after["cells"] > 0.0).sum() == kept
+    np.testing.assert_allclose(after["corner"], SITE - 12e3 + 1e3 * np.array(step))
+    if kept:
+        i, j = np.argwhere(after["cells"] > 0.0)[0]
+        assert after["cells"][i, j] == 1.0 + 24.0 * (i + step[0]) + j + step[1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from tests.services.fusion.makers import (
@@ -100,6 +102,27 @@ def test_a_sensor_may_say_anew_who_it_is() -> None:
     assert live(last) == known
     assert last.sensors == ["north"]
     assert max(nearest(last, place)[1] for place in FAR_APART.at(58.0)) < 150
+
+
+@pytest.mark.parametrize(
+    ("change", "keeps"),
+    [
+        ({"sigma": {"range_m": 60.0, "azimuth_rad": 1e-3}}, True),
+        ({"site_enu_m": [500.0, 0.0, 0.0]}, True),
+        ({"max_range_m": 90e3}, False),
+        ({"clutter_density": 1e-9}, False),
+    ],
+)
+def test_what_is_known_of_its_clutter_stays_with_a_sensor_that_looks_as_far_as_before(
+    change: dict[str, Any], keeps: bool
+) -> None:
+    tracker = engine(NORTH)
+    drive(tracker, scans(NORTH, FAR_APART, 40.0))
+    before = [c.whole() for c in (tracker.sensors["north"].local_clutter, tracker.sensors["north"].system_clutter)]
+    assert before != [c.whole() for c in (engine(NORTH).sensors["north"].local_clutter,) * 2]
+    tracker.sensor(NORTH.model_copy(update=change))
+    after = [c.whole() for c in (tracker.sensors["north"].local_clutter, tracker.sensors["north"].system_clutter)]
+    assert (after == before) is keeps
 
 
 def test_units_do_not_share_numbers() -> None:

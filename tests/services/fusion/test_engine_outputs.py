@@ -283,7 +283,7 @@ def test_what_starts_a_track_adds_nothing() -> None:
 def test_the_engine_adds_up_gains_and_misses() -> None:
     pair = fleet((30e3, 20e3, 100, 40), (-20e3, 45e3, -60, 120))
     one = Fleet(pair.start[:1], pair.velocity[:1])
-    tracker = engine(NORTH, score_cap=1e9)
+    tracker = engine(NORTH, score_cap=1e9, clutter_areas=False)
     drive(tracker, scans(NORTH, pair, 21.0))
     life = tracker._system.life
     rows = tracker._system.rows

@@ -10,8 +10,8 @@ from matplotlib.image import imread
 from trackmesh.protocol.arrays import FloatArray
 from trackmesh.protocol.errors import TrackmeshError
 from trackmesh.services.estimation.bank import as_array, make_models
-from trackmesh.services.estimation.motion import SINGER, TANGENTIAL, TURN
 from trackmesh.services.estimation.imm_tracks import ImmTracks
+from trackmesh.services.estimation.motion import SINGER, TANGENTIAL, TURN
 from trackmesh.services.fusion.settings import EngineSettings
 from trackmesh.sim.studies.filtering import Estimates, run_filter
 from trackmesh.sim.studies.manoeuvre import study, targets

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from trackmesh.protocol.messages.base import ID_PATTERN, Message
 from trackmesh.protocol.messages.emi import (
+    EmiAngles,
     EmiGeometry,
+    EmiLimit,
     EmiOptions,
+    EmiPrior,
     EmiReceiver,
     EmiResult,
     EmiScanBatch,
@@ -15,12 +18,13 @@ from trackmesh.protocol.messages.emi import (
 from trackmesh.protocol.messages.envelope import Envelope
 from trackmesh.protocol.messages.plots import Geodetic, PlotBatch, ScanPart, SensorInfo
 from trackmesh.protocol.messages.status import SensorHealth, ServiceStatus
-from trackmesh.protocol.messages.tags import RangeBatch, TagFrame
+from trackmesh.protocol.messages.tags import GONE, LOCATED, LOST, UNSURE, RangeBatch, TagFrame
 from trackmesh.protocol.messages.tracks import (
     COASTING,
     CONFIRMED,
     ENDED,
     TENTATIVE,
+    UNKNOWN_HEIGHT_M2,
     BandFrame,
     HistoryQuery,
     RefinedFrame,
@@ -57,12 +61,20 @@ __all__ = [
     "COASTING",
     "CONFIRMED",
     "ENDED",
+    "GONE",
     "ID_PATTERN",
+    "LOCATED",
+    "LOST",
     "MESSAGES",
     "TENTATIVE",
+    "UNKNOWN_HEIGHT_M2",
+    "UNSURE",
     "BandFrame",
+    "EmiAngles",
     "EmiGeometry",
+    "EmiLimit",
     "EmiOptions",
+    "EmiPrior",
     "EmiReceiver",
     "EmiResult",
     "EmiScanBatch",

@@ -52,6 +52,7 @@ COLUMN_SETS: tuple[tuple[str, ...], ...] = (
 
 Label = Annotated[str, Field(max_length=64)]
 Coordinate = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
+Speed = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
 Sigma = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
 
 
@@ -117,7 +118,9 @@ class PlotBatch(TopMessage):
 
     ``values`` has one row a plot and one column a name in ``columns`` (one of ``COLUMN_SETS``); ``variances`` likewise,
     in the square of the column's unit (metres squared for geodetic columns), or None, then ``SensorInfo.sigma`` holds.
-    ``seq`` grows by one a batch within one ``boot_id``.
+    ``seq`` grows by one a batch within one ``boot_id``. ``site`` or ``site_enu_m`` say where the sensor stood for this
+    batch, where that is not what ``SensorInfo`` says; ``site_velocity_enu_mps`` how it moved then, in the axes of that
+    place, east, north and up: range rates are those relative to it.
     """
 
     sensor_id: Id
@@ -129,6 +132,17 @@ class PlotBatch(TopMessage):
     variances: Annotated[FloatArray, ArrayField("<f8", ("n", "c"), ge=1e-18, le=1e18)] | None = None
     labels: Annotated[list[Label], Axis("n"), Field(max_length=MAX_PLOTS, fail_fast=True)] | None = None
     scan: ScanPart | None = None
+    site: Geodetic | None = None
+    site_enu_m: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] | None = None
+    site_velocity_enu_mps: Annotated[list[Speed], Field(min_length=3, max_length=3)] | None = None
+
+    @model_validator(mode="after")
+    def _one_site(self) -> Self:
+        if self.site is not None and self.site_enu_m is not None:
+            raise PydanticCustomError("invalid", "give site or site_enu_m, not both")
+        if self.site_velocity_enu_mps is not None and self.site is None and self.site_enu_m is None:
+            raise PydanticCustomError("missing_field", "site_velocity_enu_mps needs site or site_enu_m")
+        return self
 
     @model_validator(mode="after")
     def _columns_in_bounds(self) -> Self:

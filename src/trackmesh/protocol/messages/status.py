@@ -10,7 +10,7 @@ from trackmesh.protocol.messages.base import BootId, Count, Finite, Id, Message,
 
 
 class SensorHealth(Message):
-    """One sensor as a fusion unit sees it."""
+    """One sensor as a fusion unit sees it, or one network of readers as a tag service does: its plots are ranges."""
 
     sensor_id: Id
     alive: bool

@@ -24,6 +24,9 @@ from trackmesh.protocol.messages.plots import Geodetic
 TENTATIVE, CONFIRMED, COASTING, ENDED = 0, 1, 2, 3
 """Values of ``TrackFrame.status``."""
 
+UNKNOWN_HEIGHT_M2 = 1e18
+"""``TrackFrame.height_variance_m2`` of a track whose height is not known, in a frame where that of others is."""
+
 TrackId = Annotated[int, Field(ge=0, le=2**53)]
 
 _UPPER = np.triu_indices(6)
@@ -46,6 +49,9 @@ class TrackFrame(TopMessage):
     holds, per sensor of ``sensors``, the id of the local track that took the same plots, or -1. ``manoeuvre_fit`` is
     the weight of the models of turns and speed changes against a generic filter, where a filter has both. A track
     missing from a frame has not ended: only status 3, or silence, ends it.
+
+    ``height_m`` is above the ellipsoid, or above the plane where there is no ``origin``; both height fields are None
+    where no track has one. Where some have, the others have the height 0 with the variance ``UNKNOWN_HEIGHT_M2``.
     """
 
     unit_id: Id
@@ -71,6 +77,12 @@ class TrackFrame(TopMessage):
     def covariance_matrices(self) -> FloatArray:
         """Covariances as full symmetric matrices, shape (n, 6, 6)."""
         return symmetric(self.covariance)
+
+    def height_known(self) -> npt.NDArray[np.bool_]:
+        """Which tracks (n,) have a height."""
+        if self.height_m is None or self.height_variance_m2 is None:
+            return np.zeros(len(self.track_id), np.bool_)
+        return np.asarray(self.height_variance_m2 < UNKNOWN_HEIGHT_M2)
 
 
 class RefinedFrame(TopMessage):

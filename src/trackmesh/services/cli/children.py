@@ -38,6 +38,10 @@ class Children:
             )
         self._running.append((name, process))
 
+    def pid(self, name: str) -> int:
+        """Process number of a running command."""
+        return dict(self._running)[name].pid
+
     def check(self) -> None:
         """See that all run.
 

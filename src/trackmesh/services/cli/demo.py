@@ -16,19 +16,21 @@ from rich.live import Live
 from trackmesh.protocol.client import Client, Watch
 from trackmesh.protocol.errors import TrackmeshError
 from trackmesh.protocol.files import RecordWriter
-from trackmesh.protocol.messages import ServiceStatus, TrackFrame, TruthFrame
+from trackmesh.protocol.messages import ServiceStatus, TagFrame, TrackFrame, TruthFrame
 from trackmesh.protocol.zenoh_bus import ZenohBus
 from trackmesh.services.cli.children import Children
+from trackmesh.services.cli.demo_tags import TagState, reader_table
 from trackmesh.services.cli.demo_view import DemoState, demo_panel, demo_report, watch_truth
 from trackmesh.services.cli.files import records_of
 from trackmesh.services.cli.options import Scenario as ScenarioOption
 from trackmesh.services.cli.options import Seed, err, fail, out, say, told
+from trackmesh.services.cli.toml_text import toml_text
 from trackmesh.services.process import on_signal
 from trackmesh.sim.drawing import draw_tracks
 from trackmesh.sim.emi import scenario_scans
 from trackmesh.sim.scenario import Scenario, load_scenario
 
-TRACKS, TRUTH = "tracks.jsonl", "truth.jsonl"
+TRACKS, TRUTH, READERS = "tracks.jsonl", "truth.jsonl", "readers.toml"
 
 _ROUTER_S = 60.0
 _READY_S = 240.0
@@ -51,9 +53,9 @@ def demo(
 ) -> None:
     """Run the whole system on this machine, and watch it.
 
-    A router, simulated radars, a fusion unit and an EMI service run as processes of their own. At the end the picture
-    is compared with the truth: the exit code is 1 if a process failed, or if, after 45 s or more, fewer than 95 % of
-    the targets in coverage have exactly one track.
+    A router, simulated radars and readers of tags, a fusion unit, a tag service and an EMI service run as processes of
+    their own. At the end the picture is compared with the truth: the exit code is 1 if a process failed, or if, after
+    45 s or more, fewer than 95 % of the targets in coverage have exactly one track.
     """
     world = load_scenario(scenario)
     folder = _folder(out_path)
@@ -105,6 +107,10 @@ def _run(setting: Setting, seconds: float, children: Children, stop: threading.E
     children.start("router", ["router", "--listen", endpoint])
     children.start("fusion", ["fusion", "--connect", endpoint, "--black-box", str(setting.folder / "black-box.jsonl")])
     children.start("emi", ["emi", "--connect", endpoint])
+    if setting.world.tags is not None:
+        readers = setting.folder / READERS
+        readers.write_text(toml_text(reader_table(setting.world)), encoding="utf-8")
+        children.start("tags", ["tags", "--connect", endpoint, "--readers", str(readers)])
     _wait_router(children, setting.port, stop)
     if stop.is_set():
         return state
@@ -114,13 +120,16 @@ def _run(setting: Setting, seconds: float, children: Children, stop: threading.E
             frames=stack.enter_context(ask.watch_tracks(history=False)),
             statuses=stack.enter_context(ask.watch_statuses()),
             truth=stack.enter_context(watch_truth(bus, ask.keys)),
+            tags=stack.enter_context(ask.watch_tags(history=False)),
             track_file=stack.enter_context(RecordWriter(setting.folder / TRACKS)),
             truth_file=stack.enter_context(RecordWriter(setting.folder / TRUTH)),
         )
-        _wait_ready(children, watched, stop)
+        _wait_ready(children, watched, {"fusion", "emi"} | ({"tags"} if setting.world.tags else set()), stop)
         if stop.is_set():
             return state
-        _start_sensors(children, setting, endpoint)
+        if setting.world.tags is not None:
+            state.tags = TagState(setting.world)
+        _start_sensors(children, setting, endpoint, state)
         asking = threading.Thread(target=_ask_emi, args=(ask, setting, state), daemon=True)
         asking.start()
         state.begin()
@@ -129,12 +138,17 @@ def _run(setting: Setting, seconds: float, children: Children, stop: threading.E
     return state
 
 
-def _start_sensors(children: Children, setting: Setting, endpoint: str) -> None:
-    begin = ["--start-ns", str(time.time_ns()), "--connect", endpoint]
+def _start_sensors(children: Children, setting: Setting, endpoint: str, state: DemoState) -> None:
+    start_ns = time.time_ns()
+    begin = ["--start-ns", str(start_ns), "--connect", endpoint]
     common = ["--scenario", setting.scenario, "--seed", str(setting.seed), *begin]
     for radar in setting.world.radars:
         children.start(f"radar-{radar.id}", ["sim", "radar", "--radar", radar.id, *common])
     children.start("truth", ["sim", "truth", *common])
+    if state.tags is not None:
+        state.tags.start_ns = start_ns
+        # The tag service has its readers from the file.
+        children.start("readers", ["sim", "tags", "--silent", *common])
 
 
 class Watched(NamedTuple):
@@ -143,6 +157,7 @@ class Watched(NamedTuple):
     frames: Watch[TrackFrame]
     statuses: Watch[ServiceStatus]
     truth: Watch[TruthFrame]
+    tags: Watch[TagFrame]
     track_file: RecordWriter
     truth_file: RecordWriter
 
@@ -156,6 +171,8 @@ def _watch(children: Children, watched: Watched, state: DemoState, stop: threadi
             while (truth := watched.truth.receive(0)) is not None:
                 state.take_truth(truth)
                 watched.truth_file.write(truth)
+            while (tags := watched.tags.receive(0)) is not None and state.tags is not None:
+                state.tags.take(tags)
             frame = watched.frames.receive(0.1)
             if frame is not None:
                 state.take_frame(frame)
@@ -176,10 +193,10 @@ def _wait_router(children: Children, port: int, stop: threading.Event) -> None:
             raise TrackmeshError(f"The router did not listen within {_ROUTER_S:g} s.")
 
 
-def _wait_ready(children: Children, watched: Watched, stop: threading.Event) -> None:
-    """Wait until fusion and EMI are ready; the first start on a machine compiles for up to a minute."""
-    missing, began_s = {"fusion", "emi"}, time.monotonic()
-    text = "the first start on a machine compiles the numerics, which takes about a minute"
+def _wait_ready(children: Children, watched: Watched, missing: set[str], stop: threading.Event) -> None:
+    """Wait until these services are ready; the first start on a machine compiles for a minute or two."""
+    began_s = time.monotonic()
+    text = "the first start on a machine compiles the numerics, which takes a minute or two"
     tell = not err.is_terminal
     with err.status(f"starting; {text}") if err.is_terminal else nullcontext():
         while missing and not stop.is_set():

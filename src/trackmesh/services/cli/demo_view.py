@@ -17,6 +17,7 @@ from trackmesh.protocol.client import Watch
 from trackmesh.protocol.errors import TrackmeshError
 from trackmesh.protocol.keys import Keys
 from trackmesh.protocol.messages import COASTING, CONFIRMED, EmiResult, ServiceStatus, TrackFrame, TruthFrame
+from trackmesh.services.cli.demo_tags import TagState
 from trackmesh.sim.coverage import Coverage, PictureAtEnd, picture_at_end
 from trackmesh.sim.metrics import gospa
 from trackmesh.sim.radar import sensor_info
@@ -46,6 +47,7 @@ class DemoState:
         self.emi: list[EmiResult] = []
         self.emi_truth_m: FloatArray = np.empty((0, 3))
         self.emi_error = ""
+        self.tags: TagState | None = None
         self._started_s = time.monotonic()
         self._shown_s = -math.inf
         self._plots: deque[tuple[float, int]] = deque()
@@ -121,6 +123,7 @@ def demo_panel(state: DemoState) -> RenderableType:
     table.add_row("plots", _known(state.plots_per_s(), "a second"))
     table.add_row("plot to picture", _latency(state))
     table.add_row("EMI", _emi_line(state))
+    table.add_row("tags", state.tags.line() if state.tags else "-")
     return Group(table, _service_table(state))
 
 
@@ -141,6 +144,7 @@ def demo_report(state: DemoState, world: Scenario, seed: int) -> Report:
     table.add_row("plot to picture", _latency(state))
     table.add_row("frames", str(len(state.frames)))
     table.add_row("EMI", _emi_line(state))
+    table.add_row("tags", state.tags.line() if state.tags else "-")
     return Report(table, share, error or state.emi_error)
 
 

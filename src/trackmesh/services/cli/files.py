@@ -14,14 +14,14 @@ import typer
 from trackmesh.protocol.errors import TrackmeshError
 from trackmesh.protocol.files import RecordWriter, read_records
 from trackmesh.protocol.messages import MESSAGES, Message, TrackFrame, TruthFrame
-from trackmesh.services.cli.options import Config, err, say, told
+from trackmesh.services.cli.options import Config, Inputs, err, say, told
 from trackmesh.services.cli.progress import progress_bar
 
 M = TypeVar("M", bound=Message)
 
 Tracks = Annotated[Path, typer.Argument(metavar="TRACKS.jsonl", help="As written by track, or watch --out.")]
 
-convert = typer.Typer(help="Turn a recording in another format into PLOTS.jsonl.", no_args_is_help=True)
+convert = typer.Typer(help="Turn a recording in another format into PLOTS.jsonl or SCANS.jsonl.", no_args_is_help=True)
 
 
 def records_of(path: Path, kind: type[M]) -> Iterator[M]:
@@ -36,6 +36,7 @@ def track(
     plots: Annotated[Path, typer.Argument(metavar="PLOTS.jsonl", help="A recording, or a black box.")],
     out_path: Annotated[Path, typer.Option("--out", metavar="TRACKS.jsonl", help="File to write.")],
     config: Config = None,
+    inputs: Inputs = None,
     refined: Annotated[
         Path | None,
         typer.Option(
@@ -47,8 +48,8 @@ def track(
     from trackmesh.services.fusion.offline import OfflineRun
     from trackmesh.services.fusion.settings import FusionSettings
 
-    settings = FusionSettings.load(config)
-    run = OfflineRun(settings.engine, settings.unit_id, settings.unit_number, settings.origin)
+    settings = FusionSettings.load(config, {"inputs": inputs})
+    run = OfflineRun(settings.engine, settings.unit_id, settings.unit_number, settings.origin, settings.inputs)
     count, started_s = 0, time.process_time()
     with ExitStack() as opened:
         file = opened.enter_context(RecordWriter(out_path))
@@ -124,6 +125,20 @@ def convert_autoferry(
     from trackmesh.sim.autoferry import convert_autoferry as work
 
     batches, plots = work(detections, out_path, truth)
+    say(f"{plots} plots in {batches} batches in {out_path}")
+
+
+@convert.command("joyride")
+@told
+def convert_joyride(
+    mat: Annotated[Path, typer.Argument(metavar="JOYRIDE.mat", help="joyride.mat.")],
+    out_path: Annotated[Path, typer.Option("--out", metavar="PLOTS.jsonl", help="File to write.")],
+    truth: Annotated[Path | None, typer.Option("--truth", metavar="TRUTH.jsonl", help="File to write.")] = None,
+) -> None:
+    """Joyride: a ship's radar and one boat in hard manoeuvres."""
+    from trackmesh.sim.joyride import convert_joyride as work
+
+    batches, plots = work(mat, out_path, truth)
     say(f"{plots} plots in {batches} batches in {out_path}")
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from trackmesh.services.cli import files, network, services, studies
+from trackmesh.services.cli import files, induction, network, services, studies, tags
 from trackmesh.services.cli.demo import demo
 from trackmesh.services.cli.scoring import score
 from trackmesh.services.cli.tuning import tune
@@ -35,12 +35,13 @@ def _top(
 
 for command in (
     demo,
-    *(services.router, services.fusion, services.emi),
-    *(network.watch, network.tracks, network.sensors, network.status, network.play, network.invert),
-    *(files.track, score, tune, files.plot, files.schema, studies.study),
+    *(services.router, services.fusion, services.emi, tags.tags),
+    *(network.watch, network.tracks, network.sensors, network.status, network.play, induction.invert),
+    *(files.track, tags.locate, score, tune, files.plot, files.schema, studies.study),
 ):
     app.command()(command)
 app.add_typer(services.sim, name="sim")
+files.convert.command("emi-csv")(induction.convert_emi_csv)
 app.add_typer(files.convert, name="convert")
 
 

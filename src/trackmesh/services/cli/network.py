@@ -1,21 +1,23 @@
-"""Commands that ask or watch a running deployment: watch, tracks, sensors, status, play, invert."""
+"""Commands that ask or watch a running deployment: watch, tracks, sensors, status, play."""
 
 from __future__ import annotations
 
 import json
 import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from pydantic import ValidationError
+from rich.console import Group
 from rich.live import Live
 
-from trackmesh.protocol.client import Client
+from trackmesh.protocol.client import Watch
 from trackmesh.protocol.codec import refusal
 from trackmesh.protocol.files import RecordWriter, read_records, to_line
-from trackmesh.protocol.messages import EmiResult, EmiScanBatch, TrackFrame, TrackQuery
+from trackmesh.protocol.messages import TagFrame, TrackFrame, TrackQuery
 from trackmesh.services.cli.options import (
     AsJson,
     Config,
@@ -30,14 +32,14 @@ from trackmesh.services.cli.options import (
     told,
 )
 from trackmesh.services.cli.playback import play_records
-from trackmesh.services.cli.progress import progress_bar
-from trackmesh.services.cli.tables import result_table, sensor_table, status_table, track_table
+from trackmesh.services.cli.tables import sensor_table, status_table, tag_table, track_table
 from trackmesh.services.process import on_signal
 
 
 @told
 def watch(
     unit: Unit = "*",
+    only_tags: Annotated[bool, typer.Option("--tags", help="Follow the tags instead of the tracks.")] = False,
     as_json: AsJson = False,
     out_path: Annotated[
         Path | None, typer.Option("--out", metavar="TRACKS.jsonl", help="Write the frames to a file.")
@@ -51,32 +53,56 @@ def watch(
 ) -> None:
     """Follow the tracks as they are published.
 
-    On a terminal as a table; into a pipe, unless there is --out, as JSON lines.
+    On a terminal as a table, tags below the tracks; into a pipe, unless there is --out, as JSON lines of tracks, or
+    with --tags of tags.
     """
     as_json = as_json or not (out.is_terminal or out_path)
     stop = threading.Event()
     deadline_s = float("inf") if seconds is None else time.monotonic() + seconds
-    with client(connect, realm, config) as ask, on_signal(lambda _: stop.set()):
-        writer = RecordWriter(out_path) if out_path else None
-        try:
-            with ask.watch_tracks(unit) as frames, Live(console=out, auto_refresh=False, transient=True) as live:
-                while not stop.is_set() and time.monotonic() < deadline_s:
-                    frame = frames.receive(timeout_s=0.2)
-                    if frame is None:
-                        continue
-                    if writer:
-                        writer.write(frame)
-                    _show(frame, as_json, live)
-        finally:
-            if writer:
-                writer.close()
+    with ExitStack() as opened:
+        ask = opened.enter_context(client(connect, realm, config))
+        opened.enter_context(on_signal(lambda _: stop.set()))
+        writer = opened.enter_context(RecordWriter(out_path)) if out_path else None
+        watched: list[Watch[TrackFrame] | Watch[TagFrame]] = []
+        if not only_tags:
+            watched.append(opened.enter_context(ask.watch_tracks(unit)))
+        if only_tags or not (as_json or out_path):
+            watched.append(opened.enter_context(ask.watch_tags(unit)))
+        live = opened.enter_context(Live(console=out, auto_refresh=False, transient=True))
+        seen = Seen()
+        while not stop.is_set() and time.monotonic() < deadline_s:
+            for frames in watched:
+                frame = frames.receive(timeout_s=0.2 / len(watched))
+                if frame is None:
+                    continue
+                if writer:
+                    writer.write(frame)
+                if as_json:
+                    print(to_line(frame), flush=True)
+                elif out.is_terminal:
+                    seen.take(frame)
+                    live.update(seen.tables(max(5, out.height - 6)), refresh=True)
 
 
-def _show(frame: TrackFrame, as_json: bool, live: Live) -> None:
-    if as_json:
-        print(to_line(frame), flush=True)
-    elif out.is_terminal:
-        live.update(track_table([frame], most=max(5, out.height - 6)), refresh=True)
+class Seen:
+    """The last frames heard, for the eye."""
+
+    def __init__(self) -> None:
+        self._tracks: TrackFrame | None = None
+        self._tags: TagFrame | None = None
+
+    def take(self, frame: TrackFrame | TagFrame) -> None:
+        """Note a frame."""
+        if isinstance(frame, TagFrame):
+            self._tags = frame
+        else:
+            self._tracks = frame
+
+    def tables(self, most: int) -> Group:
+        """Tracks and tags, as many rows as there is room for."""
+        share = most if self._tracks is None or self._tags is None else most // 2 - 2
+        tables = [] if self._tracks is None else [track_table([self._tracks], most=share)]
+        return Group(*tables, *([] if self._tags is None else [tag_table([self._tags], most=share)]))
 
 
 @told
@@ -173,56 +199,3 @@ def play(
     with client(connect, realm, config) as ask, on_signal(lambda _: stop.set()):
         sent = play_records(ask.bus, ask.keys, records, speed, keep_time or speed != 1.0, stop)
     say(f"{sent} batches published")
-
-
-@told
-def invert(
-    scans: Annotated[Path, typer.Argument(metavar="SCANS.jsonl", help="Batches of scans.")],
-    as_json: AsJson = False,
-    local: Annotated[bool, typer.Option("--local", help="Compute here, ask no service.")] = False,
-    out_path: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="Write the results as JSON lines.")
-    ] = None,
-    unit: Unit = "*",
-    config: Config = None,
-    connect: Connect = None,
-    realm: Realm = None,
-) -> None:
-    """Ask the EMI service where the buried targets are."""
-    batches = [record for record in read_records(scans, EmiScanBatch) if isinstance(record, EmiScanBatch)]
-    if local:
-        results = [result for batch in batches for result in _invert_here(batch)]
-    else:
-        with client(connect, realm, config) as ask:
-            results = [result for batch in batches for result in _invert_there(ask, batch, unit)]
-    if out_path:
-        with RecordWriter(out_path) as file:
-            for result in results:
-                file.write(result)
-    if as_json:
-        for result in results:
-            print(to_line(result))
-    else:
-        out.print(result_table(results))
-
-
-def _invert_there(ask: Client, batch: EmiScanBatch, unit: str) -> list[EmiResult]:
-    results = []
-    with progress_bar(batch.batch_id, len(batch.field)) as advance:
-        for result in ask.invert(batch, unit):
-            results.append(result)
-            advance(len(results))
-    return results
-
-
-def _invert_here(batch: EmiScanBatch) -> list[EmiResult]:
-    from trackmesh.services.emi.convert import to_message, to_request
-    from trackmesh.services.emi.engine import invert as work
-    from trackmesh.services.emi.settings import EmiSettings
-
-    results = []
-    with progress_bar(batch.batch_id, len(batch.field)) as advance:
-        for result in work(*to_request(batch, EmiSettings().lr_threshold)):
-            results.append(to_message(batch, result))
-            advance(len(results))
-    return results

@@ -31,6 +31,10 @@ Connect = Annotated[
 Realm = Annotated[
     str | None, typer.Option("--realm", metavar="NAME", help="Key space of the deployment; default: trackmesh.")
 ]
+Inputs = Annotated[
+    str | None,
+    typer.Option("--inputs", metavar="UNITS", help="Take the tracks of these units as well, separated by commas."),
+]
 UnitId = Annotated[str | None, typer.Option("--unit-id", metavar="NAME", help="Name of this service; default: main.")]
 Unit = Annotated[
     str, typer.Option("--unit", metavar="NAME", help="Ask this unit only; default: all.", show_default=False)

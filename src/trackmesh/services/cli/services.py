@@ -11,6 +11,7 @@ import typer
 from trackmesh.services.cli.options import (
     Config,
     Connect,
+    Inputs,
     LogFormat,
     LogLevel,
     Realm,
@@ -73,6 +74,11 @@ def fusion(
         int | None,
         typer.Option("--unit-number", min=0, max=4095, metavar="N", help="Unique in the realm, 0 to 4095; default: 0."),
     ] = None,
+    sensors: Annotated[
+        str | None,
+        typer.Option("--sensors", metavar="NAMES", help="Take plots of these only, separated by commas; default: all."),
+    ] = None,
+    inputs: Inputs = None,
     clock: Annotated[
         Literal["wall", "data"] | None,
         typer.Option("--clock", help="wall: plots are of now; data: they bring their own time (replays)."),
@@ -97,7 +103,8 @@ def fusion(
     from trackmesh.services.fusion.settings import FusionSettings
 
     flags = given(
-        connect=connect, realm=realm, unit_id=unit_id, unit_number=unit_number, clock=clock, black_box=black_box,
+        connect=connect, realm=realm, unit_id=unit_id, unit_number=unit_number,
+        sensors=sensors, inputs=inputs, clock=clock, black_box=black_box,
         registration_file=registration_file, state_file=state_file,
         log_level=log_level, log_format=log_format,
     )  # fmt: skip
@@ -110,6 +117,12 @@ def emi(
     connect: Connect = None,
     realm: Realm = None,
     unit_id: UnitId = None,
+    processes: Annotated[
+        int | None,
+        typer.Option(
+            "--processes", min=0, metavar="N", help="That compute; 0: the service itself; default: all cores."
+        ),
+    ] = None,
     workers: Annotated[
         int | None, typer.Option("--workers", min=1, metavar="N", help="Requests answered at a time.")
     ] = None,
@@ -117,12 +130,13 @@ def emi(
     log_format: LogFormat = None,
 ) -> None:
     """Run an EMI service: induction scans in, targets out."""
-    from trackmesh.services.emi.service import main
-    from trackmesh.services.emi.settings import EmiSettings
+    from trackmesh.services.emi.service.main import main
+    from trackmesh.services.emi.service.settings import EmiSettings
 
     flags = given(
-        connect=connect, realm=realm, unit_id=unit_id, workers=workers, log_level=log_level, log_format=log_format
-    )
+        connect=connect, realm=realm, unit_id=unit_id, processes=processes, workers=workers, log_level=log_level,
+        log_format=log_format,
+    )  # fmt: skip
     raise typer.Exit(main(EmiSettings.load(config, flags)))
 
 

@@ -21,18 +21,20 @@ def _studies() -> dict[str, Study]:
     from trackmesh.sim.studies import alpha_beta, tvimm
     from trackmesh.sim.studies.association import study as association
     from trackmesh.sim.studies.manoeuvre import study as manoeuvre
+    from trackmesh.sim.studies.rfid import study as rfid
 
     return {
         "tvimm": tvimm.run,
         "manoeuvre": manoeuvre.run,
         "association": association.run,
         "alpha-beta": alpha_beta.run,
+        "rfid": rfid.run,
     }
 
 
 @told
 def study(
-    name: Annotated[str, typer.Argument(help="tvimm, manoeuvre, association or alpha-beta")],
+    name: Annotated[str, typer.Argument(help="tvimm, manoeuvre, association, alpha-beta or rfid")],
     json_path: Annotated[Path | None, typer.Option("--json", help="Write the rows here.")] = None,
     plots: Annotated[Path | None, typer.Option("--plots", help="Write the figures to this folder.")] = None,
     runs: Annotated[int, typer.Option("--runs", min=0, help="Monte-Carlo runs; 0: as many as the study needs.")] = 0,

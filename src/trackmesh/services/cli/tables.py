@@ -9,13 +9,15 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from rich.table import Table
 
-from trackmesh.protocol.messages import EmiResult, SensorBias, SensorInfo, ServiceStatus, TrackFrame
+from trackmesh.protocol.messages import EmiResult, SensorBias, SensorInfo, ServiceStatus, TagFrame, TrackFrame
 
 STATUS_NAMES = ("tentative", "confirmed", "coasting", "ended")
+TAG_STATUS_NAMES = ("unsure", "located", "lost", "gone")
 
 
 def track_table(frames: Sequence[TrackFrame], most: int = 40) -> Table:
-    """One row a track: where it is, how it moves, how well that is known."""
+    """One row a track: where it is, how it moves, how well that is known; heights where there are any."""
+    high = any(f.height_m is not None for f in frames)
     total = sum(len(f.track_id) for f in frames)
     shown = f", the first {most}" if total > most else ""
     table = Table(title=f"{total} tracks{shown}", title_justify="left")
@@ -25,6 +27,7 @@ def track_table(frames: Sequence[TrackFrame], most: int = 40) -> Table:
         "status",
         "east km",
         "north km",
+        *(["height m"] if high else []),
         "speed m/s",
         "course",
         "1 sigma m",
@@ -34,11 +37,11 @@ def track_table(frames: Sequence[TrackFrame], most: int = 40) -> Table:
         table.add_column(name, justify="left" if name in ("unit", "status", "sensors") else "right")
     rows = ((frame, row) for frame in frames for row in range(len(frame.track_id)))
     for _, (frame, row) in zip(range(most), rows, strict=False):
-        table.add_row(*_track_row(frame, row))
+        table.add_row(*_track_row(frame, row, high))
     return table
 
 
-def _track_row(frame: TrackFrame, row: int) -> list[str]:
+def _track_row(frame: TrackFrame, row: int, high: bool) -> list[str]:
     east, north, veast, vnorth = frame.state[row, :4].tolist()
     sigma = math.sqrt(max(float(frame.covariance[row, 0] + frame.covariance[row, 6]), 0.0))
     members = [s for s, m in zip(frame.sensors, frame.members[row].tolist(), strict=True) if m >= 0]
@@ -48,11 +51,51 @@ def _track_row(frame: TrackFrame, row: int) -> list[str]:
         STATUS_NAMES[int(frame.status[row])],
         f"{east / 1e3:.2f}",
         f"{north / 1e3:.2f}",
+        *([_height(frame, row)] if high else []),
         f"{math.hypot(veast, vnorth):.0f}",
         f"{math.degrees(math.atan2(veast, vnorth)) % 360:03.0f}",
         f"{sigma:.0f}",
         f"{(frame.t_ns - int(frame.updated_t_ns[row])) / 1e9:.1f}",
         ", ".join(members),
+    ]
+
+
+def _height(frame: TrackFrame, row: int) -> str:
+    if frame.height_m is None or frame.height_variance_m2 is None or not frame.height_known()[row]:
+        return "-"
+    return f"{frame.height_m[row]:.0f} ± {math.sqrt(frame.height_variance_m2[row]):.0f}"
+
+
+def tag_table(frames: Sequence[TagFrame], most: int = 40) -> Table:
+    """One row a tag: where it is, how it moves, how well that is known, and who heard it."""
+    total = sum(len(f.tag_id) for f in frames)
+    shown = f", the first {most}" if total > most else ""
+    table = Table(title=f"{total} tags{shown}", title_justify="left")
+    for name in ("unit", "tag", "status", "east m", "north m", "or at m", "speed m/s", "1 sigma m", "fit", "age s"):
+        table.add_column(name, justify="left" if name in ("unit", "tag", "status") else "right")
+    table.add_column("readers")
+    rows = ((frame, row) for frame in frames for row in np.argsort(frame.tag_id).tolist())
+    for _, (frame, row) in zip(range(most), rows, strict=False):
+        table.add_row(*_tag_row(frame, row))
+    return table
+
+
+def _tag_row(frame: TagFrame, row: int) -> list[str]:
+    east, north, veast, vnorth = frame.state[row, :4].tolist()
+    sigma = math.sqrt(max(float(frame.covariance[row, 0] + frame.covariance[row, 6]), 0.0))
+    elsewhere = frame.other[row].tolist()
+    return [
+        frame.unit_id,
+        frame.tag_id[row],
+        TAG_STATUS_NAMES[int(frame.status[row])],
+        f"{east:.1f}",
+        f"{north:.1f}",
+        "-" if elsewhere == [east, north] else f"{elsewhere[0]:.1f}, {elsewhere[1]:.1f}",
+        f"{math.hypot(veast, vnorth):.1f}",
+        f"{sigma:.1f}",
+        f"{frame.quality[row]:.0%}",
+        f"{(frame.t_ns - int(frame.updated_t_ns[row])) / 1e9:.1f}",
+        ", ".join(frame.readers_of(row)),
     ]
 
 
@@ -66,7 +109,9 @@ def sensor_table(sensors: Iterable[SensorInfo], alive: set[str], biases: Mapping
         if s.site is not None:
             site = f"{s.site.latitude_deg:.4f}, {s.site.longitude_deg:.4f}"
         elif s.site_enu_m is not None:
-            site = f"{s.site_enu_m[0] / 1e3:.1f} km E, {s.site_enu_m[1] / 1e3:.1f} km N"
+            east, north = s.site_enu_m[:2]
+            near = s.kind == "ranging"
+            site = f"{east:.1f} m E, {north:.1f} m N" if near else f"{east / 1e3:.1f} km E, {north / 1e3:.1f} km N"
         sigma = ", ".join(f"{name} {value:g}" for name, value in s.sigma.items())
         alive_word = "yes" if s.sensor_id in alive else "no"
         table.add_row(
@@ -122,7 +167,7 @@ def status_table(statuses: Iterable[ServiceStatus]) -> Table:
             s.unit_id,
             s.state,
             f"{s.uptime_s:.0f}",
-            f"{s.figures['tracks']:.0f}" if "tracks" in s.figures else "-",
+            next((f"{s.figures[name]:.0f}" for name in ("tracks", "tags") if name in s.figures), "-"),
             _pairs(s.counters),
             _pairs(s.refused),
             latency,
@@ -130,7 +175,11 @@ def status_table(statuses: Iterable[ServiceStatus]) -> Table:
         )
         for sensor in s.sensors:
             life = "alive" if sensor.alive else "gone"
-            counted = f"{sensor.plots} plots, {sensor.batches} batches, {sensor.gaps} missing, {sensor.refused} refused"
+            is_unit = f"input_tracks.{sensor.sensor_id}" in s.figures
+            plots, batches = ("tracks", "frames") if is_unit else ("plots", "batches")
+            counted = (
+                f"{sensor.plots} {plots}, {sensor.batches} {batches}, {sensor.gaps} missing, {sensor.refused} refused"
+            )
             table.add_row(f"  {sensor.sensor_id}", "", life, "", "", counted, "", "", "")
     return table
 

@@ -17,11 +17,8 @@ from math import pi, sqrt
 
 import numpy as np
 
-from trackmesh.services.emi.kernels import FloatArray, kernel
-
-Vector = tuple[float, float, float]
-Symmetric = tuple[float, float, float, float, float, float]
-"""Elements xx, yy, zz, xy, xz, yz of a symmetric matrix."""
+from trackmesh.services.emi.kernels import FloatArray, inlined, kernel
+from trackmesh.services.emi.vectors import Symmetric, Vector, add, dot, dyad, minus, scaled, times, vector
 
 MU0 = 4e-7 * pi
 """Magnetic constant, H/m (the value before 2019; today's differs by 1.3e-10)."""
@@ -73,42 +70,7 @@ def loop_terms(rho2: float, z: float, radius: float) -> tuple[float, float, floa
     return g, f, g_z, f_z
 
 
-@kernel
-def dot(a: Vector, b: Vector) -> float:
-    """Scalar product."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@kernel
-def times(s: Symmetric, v: Vector) -> Vector:
-    """Symmetric matrix times vector."""
-    return (
-        s[0] * v[0] + s[3] * v[1] + s[4] * v[2],
-        s[3] * v[0] + s[1] * v[1] + s[5] * v[2],
-        s[4] * v[0] + s[5] * v[1] + s[2] * v[2],
-    )
-
-
-@kernel
-def dyad(a: Vector, b: Vector, scale: float, trace: float) -> Symmetric:
-    """Symmetric product: scale (a b^T + b a^T) + trace I."""
-    return (
-        2.0 * scale * a[0] * b[0] + trace,
-        2.0 * scale * a[1] * b[1] + trace,
-        2.0 * scale * a[2] * b[2] + trace,
-        scale * (a[0] * b[1] + a[1] * b[0]),
-        scale * (a[0] * b[2] + a[2] * b[0]),
-        scale * (a[1] * b[2] + a[2] * b[1]),
-    )
-
-
-@kernel
-def add(a: Symmetric, b: Symmetric) -> Symmetric:
-    """Sum of symmetric matrices."""
-    return (a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5])
-
-
-@kernel
+@inlined
 def green(d: Vector) -> Symmetric:
     """G(d) = (3 d d^T / d^2 - I) / d^3, in m^-3."""
     d2 = dot(d, d)
@@ -116,7 +78,7 @@ def green(d: Vector) -> Symmetric:
     return dyad(d, d, 1.5 * inverse_cube / d2, -inverse_cube)
 
 
-@kernel
+@inlined
 def green_gradient(d: Vector, m: Vector) -> Symmetric:
     """Gradient of G(d) m by d: 3/d^5 [(d.m) (I - 5 d d^T / d^2) + d m^T + m d^T], which has no trace."""
     d2, dm = dot(d, d), dot(d, m)
@@ -128,7 +90,7 @@ def green_gradient(d: Vector, m: Vector) -> Symmetric:
 def loop_primary(d: Vector, axis: Vector, radius: float) -> tuple[Vector, Symmetric]:
     """Field and gradient of a loop with unit moment, ``d`` from its centre."""
     z = dot(d, axis)
-    rho = (d[0] - z * axis[0], d[1] - z * axis[1], d[2] - z * axis[2])
+    rho = minus(d, scaled(axis, z))
     rho2 = dot(rho, rho)
     g, f, g_z, f_z = loop_terms(rho2, z, radius)
     # div H = 0 gives the radial derivative from the axial one, curl H = 0 makes the gradient symmetric.
@@ -139,15 +101,15 @@ def loop_primary(d: Vector, axis: Vector, radius: float) -> tuple[Vector, Symmet
     return h, add(gradient, dyad(rho, axis, c * g_z, 0.0))
 
 
-@kernel
+@inlined
 def dipole_primary(d: Vector, axis: Vector) -> tuple[Vector, Symmetric]:
     """Field and gradient of a point dipole with unit moment, ``d`` from it."""
     c = 0.25 / pi
-    moment = (c * axis[0], c * axis[1], c * axis[2])
+    moment = scaled(axis, c)
     return times(green(d), moment), green_gradient(d, moment)
 
 
-@kernel
+@inlined
 def primary(d: Vector, axis: Vector, radius: float) -> tuple[Vector, Symmetric]:
     """Field and gradient of a transmitter with unit moment: a loop, or a dipole where ``radius`` is 0."""
     if radius > 0.0:
@@ -156,16 +118,10 @@ def primary(d: Vector, axis: Vector, radius: float) -> tuple[Vector, Symmetric]:
 
 
 @kernel
-def vector(row: FloatArray) -> Vector:
-    """A row (3,) of an array."""
-    return (row[0], row[1], row[2])
-
-
-@kernel
 def _primary_many(d: FloatArray, axis: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
     h, gradient = np.empty((len(d), 3)), np.empty((len(d), 6))
     for i in range(len(d)):
-        h_i, g_i = primary(vector(d[i]), vector(axis[i]), radius)
+        h_i, g_i = primary(vector(d, i), vector(axis, i), radius)
         for j in range(3):
             h[i, j] = h_i[j]
         for j in range(6):
@@ -177,8 +133,18 @@ def _primary_many(d: FloatArray, axis: FloatArray, radius: float) -> tuple[Float
 def _secondary_many(d: FloatArray, moment: FloatArray) -> FloatArray:
     out = np.empty((len(d), 3))
     for i in range(len(d)):
-        b = times(green(vector(d[i])), vector(moment[i]))
+        b = times(green(vector(d, i)), vector(moment, i))
         out[i, 0], out[i, 1], out[i, 2] = b
+    return out
+
+
+@kernel
+def _green_many(d: FloatArray) -> FloatArray:
+    out = np.empty((len(d), 6))
+    for i in range(len(d)):
+        g = green(vector(d, i))
+        for j in range(6):
+            out[i, j] = g[j]
     return out
 
 
@@ -217,7 +183,7 @@ def secondary_field(offset_m: FloatArray, moment_am2: FloatArray) -> FloatArray:
 
 def green_tensor(offset_m: FloatArray) -> FloatArray:
     """G(d) for ``offset_m`` (n, 3): (n, 3, 3) in m^-3."""
-    return from_elements(np.array([green(vector(d)) for d in np.asarray(offset_m, np.float64)]))
+    return from_elements(_green_many(np.ascontiguousarray(offset_m, np.float64)))
 
 
 def to_elements(matrix: FloatArray) -> FloatArray:

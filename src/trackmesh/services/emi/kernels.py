@@ -9,9 +9,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from trackmesh.services.estimation.jit import inlined
 from trackmesh.services.estimation.jit import parallel_kernel as kernel
 
-__all__ = ["BoolArray", "FloatArray", "IntArray", "kernel"]
+__all__ = ["BoolArray", "FloatArray", "IntArray", "inlined", "kernel"]
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]

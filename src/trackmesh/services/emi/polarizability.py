@@ -17,8 +17,11 @@ from trackmesh.services.emi.kernels import FloatArray
 
 ComplexArray = npt.NDArray[np.complex128]
 
+DECAYED = 40.0
+"""Exponent beyond which nothing is left of a term."""
+MOST_TERMS = 20_000
 TAU_LONG = 31.0
-"""A cylinder's axial time constant by its transverse one (the thesis prints 3 L, which has the wrong unit)."""
+"""A cylinder's axial time constant by its transverse one (the thesis prints 3 L, which has a unit)."""
 
 
 def sphere(radius_m: float, omega_rad_s: float, conductivity_s_m: float, mu_r: float = 1.0) -> complex:
@@ -33,12 +36,56 @@ def sphere(radius_m: float, omega_rad_s: float, conductivity_s_m: float, mu_r: f
     return 2.0 * pi * radius_m**3 * (2.0 * mu_r - q) / (mu_r + q)
 
 
+def sphere_step_off(
+    radius_m: float,
+    times_s: FloatArray,
+    conductivity_s_m: float,
+    mu_r: float = 1.0,
+    *,
+    rate: bool = False,
+) -> FloatArray:
+    """Polarizability (m^3) of a sphere at times (n,) > 0 after a steady field was switched off; or -d/dt of it (m^3/s).
+
+    M = 12 pi a^3 mu_r sum_k exp(-x_k^2 t / tau) / (x_k^2 + (mu_r - 1) (mu_r + 2)), tau = sigma mu a^2, with x_k > 0 the
+    roots of tan x = (mu_r - 1) x / (mu_r - 1 + x^2) (J. R. Wait and K. P. Spies, Canadian J. Physics 47, 1969): the
+    poles of ``sphere``, and so what time gates see of it.
+
+    Raises:
+        ValueError: a time is not positive.
+    """
+    times_s = np.asarray(times_s, np.float64)
+    if not (times_s > 0.0).all():
+        raise ValueError("Times must be after the field was switched off.")
+    tau_s = conductivity_s_m * MU0 * mu_r * radius_m**2
+    least = float(times_s.min()) / tau_s
+    x2 = decay_roots(mu_r, min(MOST_TERMS, 2 + int(np.sqrt(DECAYED / least) / pi))) ** 2
+    weight = 12.0 * pi * radius_m**3 * mu_r / (x2 + (mu_r - 1.0) * (mu_r + 2.0))
+    return np.asarray(np.exp(-x2 * (times_s[:, None] / tau_s)) @ (weight * x2 / tau_s if rate else weight))
+
+
+def decay_roots(mu_r: float, n: int) -> FloatArray:
+    """The first roots (n,) x > 0 of tan x = (mu_r - 1) x / (mu_r - 1 + x^2), by bisection: one a half turn."""
+    low = pi * np.arange(1, n + 1)
+    high = low + 0.5 * pi
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        excess = (middle**2 + mu_r - 1.0) * np.sin(middle) - (mu_r - 1.0) * middle * np.cos(middle)
+        beyond = excess * np.cos(low) > 0.0
+        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+    return 0.5 * (low + high)
+
+
 def cylinder(
-    radius_m: float, length_m: float, omega_rad_s: float, conductivity_s_m: float, mu_r: float = 1.0
+    radius_m: float,
+    length_m: float,
+    omega_rad_s: float,
+    conductivity_s_m: float,
+    mu_r: float = 1.0,
+    tau_long: float = TAU_LONG,
 ) -> tuple[complex, complex]:
     """Polarizability (m^3) of a conducting cylinder, transverse and axial.
 
-    M = -3/2 beta with beta_t = V/2 (0.35 + f(tau)), beta_a = L V / (4 a) (f(31 tau) - 0.7),
+    M = -3/2 beta with beta_t = V/2 (0.35 + f(tau)), beta_a = L V / (4 a) (f(tau_long tau) - 0.7),
     f(tau) = (sqrt(j omega tau) - 2) / (sqrt(j omega tau) + 1), tau = a^2 sigma mu / mu_r^2 (the form used by
     Liu Zhiyang, EMI detection by filter tracking, 2018, equations 5-3 and 5-4, with the unit of the axial time
     constant set right).
@@ -46,7 +93,7 @@ def cylinder(
     volume = pi * radius_m**2 * length_m
     tau_s = radius_m**2 * conductivity_s_m * MU0 / mu_r
     transverse = 0.5 * volume * (0.35 + _relaxation(omega_rad_s * tau_s))
-    axial = length_m * volume / (4.0 * radius_m) * (_relaxation(omega_rad_s * TAU_LONG * tau_s) - 0.7)
+    axial = length_m * volume / (4.0 * radius_m) * (_relaxation(omega_rad_s * tau_long * tau_s) - 0.7)
     return from_thesis_beta(transverse), from_thesis_beta(axial)
 
 

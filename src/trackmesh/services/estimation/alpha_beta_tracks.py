@@ -7,7 +7,6 @@ plot. Plots must come in order of time: a late one is refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +16,8 @@ from trackmesh.services.estimation import gating
 from trackmesh.services.estimation.alpha_beta import combined_gains, manoeuvring_index
 from trackmesh.services.estimation.gating import Mixture, Strength, make_mixture
 from trackmesh.services.estimation.jit import kernel
-from trackmesh.services.estimation.plots import Plot, Plots, empty_plots
+from trackmesh.services.estimation.joint import NO_ODDS, Odds
+from trackmesh.services.estimation.plots import Move, Plot, Plots, empty_plots
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -159,6 +159,10 @@ class AlphaBetaTracks:
         """(n, 4) states at the last plots."""
         return self._rows.x
 
+    def figures(self) -> dict[str, int]:
+        """Nothing to tell."""
+        return {}
+
     def begin(self, rows: IntArray, plots: Plots) -> None:
         """Start tracks in rows, from one plot each."""
         _begin(self._rows, rows, plots, self._sigma_v_mps)
@@ -182,13 +186,16 @@ class AlphaBetaTracks:
         """None."""
         return empty_plots((0,))
 
-    def move_plots(self, sensor: int, move: Callable[[FloatArray], FloatArray], later_s: float = 0.0) -> None:
+    def move_plots(self, sensor: int, move: Move, later_s: float = 0.0) -> None:
         """Nothing: no plots are remembered."""
 
     def associate(
-        self, rows: IntArray, first: BoolArray, plots: Plots, limit: float
+        self, rows: IntArray, first: BoolArray, plots: Plots, limit: float, odds: Odds = NO_ODDS
     ) -> tuple[IntArray, FloatArray, BoolArray]:
-        """Give plots to rows, one to one: (m,) row of each plot or -1, cost, and whether it was not too late."""
+        """Give plots to rows, one to one: (m,) row of each plot or -1, cost, and whether it was not too late.
+
+        Never jointly, whatever the odds.
+        """
         m = len(plots)
         row, cost, fed = np.full(m, -1, np.int64), np.zeros(m), np.zeros(m, np.bool_)
         own = self._rows

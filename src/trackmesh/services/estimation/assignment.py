@@ -34,14 +34,7 @@ def assign(row: IntArray, column: IntArray, score: FloatArray, n_rows: int, n_co
     k = len(row)
     if k == 0:
         return result
-    parent = np.arange(n_rows + n_columns)
-    for e in range(k):
-        a, b = _root(parent, row[e]), _root(parent, n_rows + column[e])
-        if a != b:
-            parent[max(a, b)] = min(a, b)
-    component = np.empty(k, np.int64)
-    for e in range(k):
-        component[e] = _root(parent, row[e])
+    component = components(row, column, n_rows, n_columns)
     order = np.argsort(component, kind="mergesort")
     local_row, local_column = np.full(n_rows, -1, np.int64), np.full(n_columns, -1, np.int64)
     start = 0
@@ -56,6 +49,21 @@ def assign(row: IntArray, column: IntArray, score: FloatArray, n_rows: int, n_co
             _solve_component(row, column, score, edges, local_row, local_column, result)
         start = stop
     return result
+
+
+@kernel
+def components(row: IntArray, column: IntArray, n_rows: int, n_columns: int) -> IntArray:
+    """Number of the connected component of each pair (k,): pairs that share a row or a column are of one."""
+    k = len(row)
+    parent = np.arange(n_rows + n_columns)
+    for e in range(k):
+        a, b = _root(parent, row[e]), _root(parent, n_rows + column[e])
+        if a != b:
+            parent[max(a, b)] = min(a, b)
+    component = np.empty(k, np.int64)
+    for e in range(k):
+        component[e] = _root(parent, row[e])
+    return component
 
 
 @kernel

@@ -8,7 +8,15 @@ from typing import Literal
 import numpy as np
 
 from trackmesh.services.estimation.bank import Branch
-from trackmesh.services.estimation.motion import CONSTANT_VELOCITY, SINGER, TANGENTIAL, TURN, Model
+from trackmesh.services.estimation.motion import (
+    CONSTANT_ACCELERATION,
+    CONSTANT_VELOCITY,
+    RANDOM_WALK,
+    SINGER,
+    TANGENTIAL,
+    TURN,
+    Model,
+)
 
 FilterName = Literal["tvimm", "tvimm-dirichlet", "tvimm-paper", "imm", "alpha-beta"]
 
@@ -68,3 +76,14 @@ def generic_models(acceleration_max_mps2: float, manoeuvre_s: float, quiet_s: fl
     )
     jumps = np.array([[0, 0.5, 0.5], [0.5, 0, 0.5], [0.5, 0.5, 0]])
     return Branch(models, (1.15 * quiet_s, 3.0 * t, 3.0 * t), jumps, start=(0.8, 0.1, 0.1))
+
+
+def with_more_noise(branch: Branch, q_m2ps3: float) -> Branch:
+    """The branch with ``q_m2ps3`` more of acceleration noise in every model.
+
+    Raises:
+        ValueError: a model has noise of another kind (random walk, constant acceleration).
+    """
+    if any(model.kind in (RANDOM_WALK, CONSTANT_ACCELERATION) for model in branch.models):
+        raise ValueError("q of random walk and constant acceleration is no acceleration noise")
+    return branch._replace(models=tuple(model._replace(q=model.q + q_m2ps3) for model in branch.models))

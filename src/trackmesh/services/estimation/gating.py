@@ -122,7 +122,11 @@ def gate(
         r_max = max(r_max, plot.R[0], plot.R[2])
         late, early = max(late, plot.t_s), min(early, plot.t_s)
     order = np.argsort(values)
+    # Side by side in memory: the scan of a window touches nothing else.
     north = values[order]
+    east = np.empty(m)
+    for k in range(m):
+        east[k] = plots[order[k]].z[0]
     size = 8 * (n + m) + 64
     ii: IntArray = np.empty(size, np.int64)
     jj: IntArray = np.empty(size, np.int64)
@@ -131,18 +135,19 @@ def gate(
     for i in range(n):
         span = max(abs(late - t_s[i]), abs(early - t_s[i]))
         low = west = np.inf
-        high = east = -np.inf
+        high = far_east = -np.inf
         for a in range(r):
             reach = np.sqrt(limit * (P[i, a, 1, 1] + r_max)) + span * abs(x[i, a, 3])
             low, high = min(low, x[i, a, 1] - reach), max(high, x[i, a, 1] + reach)
             reach = np.sqrt(limit * (P[i, a, 0, 0] + r_max)) + span * abs(x[i, a, 2])
-            west, east = min(west, x[i, a, 0] - reach), max(east, x[i, a, 0] + reach)
-        k = np.searchsorted(north, low)
+            west, far_east = min(west, x[i, a, 0] - reach), max(far_east, x[i, a, 0] + reach)
+        k = int(np.searchsorted(north, low))
         while k < m and north[k] <= high:
+            if east[k] < west or east[k] > far_east:
+                k += 1
+                continue
             j = order[k]
             k += 1
-            if plots[j].z[0] < west or plots[j].z[0] > east:
-                continue
             value = mixture_cost(x[i], P[i], mu[i], plots[j].z, plots[j].R, plots[j].t_s - t_s[i], limit)
             if np.isinf(value):
                 continue
@@ -166,12 +171,18 @@ def choose(
         cost: (m,) written: that of the chosen pairs.
     """
     i, j, pair_cost = gate(tracks, t_s, plots, limit)
+    return choose_among(i, j, pair_cost, first, cost)
+
+
+@kernel
+def choose_among(i: IntArray, j: IntArray, pair_cost: FloatArray, first: BoolArray, cost: FloatArray) -> IntArray:
+    """As ``choose``, among pairs that are known: track, plot and cost, each (k,), as ``gate`` gives them."""
     score = np.empty(len(i))
     for e in range(len(i)):
         score[e] = max(_SCORE_AT_ZERO - pair_cost[e], _LEAST_SCORE)
         if first[i[e]]:
             score[e] += _CHOOSES_FIRST
-    chosen = assign(i, j, score, len(t_s), len(plots))
+    chosen = assign(i, j, score, len(first), len(cost))
     for e in range(len(i)):
         if chosen[j[e]] == i[e]:
             cost[j[e]] = pair_cost[e]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,9 @@ import numpy.typing as npt
 from trackmesh.services.estimation import tracks
 from trackmesh.services.estimation.bank import Models
 from trackmesh.services.estimation.gating import Mixture, Strength, make_mixture
+from trackmesh.services.estimation.joint import NO_ODDS, Odds
 from trackmesh.services.estimation.motion import TURN
-from trackmesh.services.estimation.plots import Plots
+from trackmesh.services.estimation.plots import Move, Plots
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -33,12 +33,14 @@ def strength(models: Models) -> Strength:
 class ImmTracks:
     """The filters of a layer of tracks: interacting multiple models with rings."""
 
-    def __init__(self, models: Models, rows: int, ring: int, sigma_v_mps: float) -> None:
+    def __init__(self, models: Models, rows: int, ring: int, sigma_v_mps: float, joint: bool = False) -> None:
         self.models = models
         self.filters = tracks.make_filters(models, rows, ring)
         self._ring = ring
         self._sigma_v_mps = sigma_v_mps
         self._strength = strength(models)
+        self._joint = joint
+        self._tally = np.zeros(2, np.int64)
 
     @property
     def t_s(self) -> FloatArray:
@@ -60,6 +62,12 @@ class ImmTracks:
         """How often a covariance that was none had to be replaced."""
         return int(self.filters.work["repairs"][0])
 
+    def figures(self) -> dict[str, int]:
+        """How many clusters of close tracks were associated jointly, and how many were too large for that."""
+        if not self._joint:
+            return {}
+        return dict(zip(("joint_clusters", "joint_too_large"), self._tally.tolist(), strict=True))
+
     def begin(self, rows: IntArray, plots: Plots) -> None:
         """Start tracks in rows, from one plot each."""
         tracks.begin(self.filters, rows, plots, self._sigma_v_mps)
@@ -77,12 +85,12 @@ class ImmTracks:
         """The last plots of a row, in order of time."""
         return self.filters.ring[row, : self.filters.ring_n[row]].copy()
 
-    def move_plots(self, sensor: int, move: Callable[[FloatArray], FloatArray], later_s: float = 0.0) -> None:
+    def move_plots(self, sensor: int, move: Move, later_s: float = 0.0) -> None:
         """Move the remembered plots of a sensor in the plane and in time, and filter all again from the base.
 
         Args:
             sensor: whose plots.
-            move: positions (m, 2) to (m, 2).
+            move: where they belong instead.
             later_s: added to their times; what falls before the base is forgotten.
         """
         f = self.filters
@@ -90,7 +98,7 @@ class ImmTracks:
         ours = there & (f.ring["sensor"] == sensor)
         if not ours.any():
             return
-        f.ring["z"][ours] = move(f.ring["z"][ours])
+        f.ring["z"][ours] = move(f.ring[ours])
         f.ring["t_s"][ours] += later_s
         rows = np.flatnonzero(ours.any(axis=1))
         row, place = np.nonzero(there[rows])
@@ -100,10 +108,14 @@ class ImmTracks:
         tracks.feed(f, rows[row], plots)
 
     def associate(
-        self, rows: IntArray, first: BoolArray, plots: Plots, limit: float
+        self, rows: IntArray, first: BoolArray, plots: Plots, limit: float, odds: Odds = NO_ODDS
     ) -> tuple[IntArray, FloatArray, BoolArray]:
-        """Give plots to rows, one to one: (m,) row of each plot or -1, cost, and whether it was not too late."""
-        return tracks.associate(self.filters, rows, first, plots, limit, self._strength)
+        """Give plots to rows, one to one: (m,) row of each plot or -1, cost, and whether it was not too late.
+
+        Of a ``joint`` layer, rows of ``first`` that are close are fed weighted means of plots (see ``joint``).
+        """
+        odds = odds if self._joint else NO_ODDS
+        return tracks.associate(self.filters, rows, first, plots, limit, self._strength, odds, self._tally)
 
     def predict(self, rows: IntArray, t_s: FloatArray) -> tuple[Mixture, BoolArray]:
         """Predictions of rows to their times, and which of them are known."""

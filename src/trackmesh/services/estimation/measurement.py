@@ -66,15 +66,17 @@ def _update_position(x: FloatArray, P: FloatArray, d: int, z: FloatArray, R: Flo
 def range_rate(x: FloatArray, plot: Plot, h: FloatArray) -> float:
     """Range rate that a state (>= 4,) predicts for a plot; its gradient by position and velocity is written to h (4,).
 
-    rho' = level v^T u with u = (p - site) / |p - site|: d rho'/dv = level u, d rho'/dp = level (v - (v^T u) u) / |p -
-    site|. ``level`` is the cosine of the elevation; the target is supposed to stay at its height.
+    rho' = level v^T u with v the velocity relative to the sensor and u = (p - site) / |p - site|: d rho'/dv = level u,
+    d rho'/dp = level (v - (v^T u) u) / |p - site|. ``level`` is the cosine of the elevation; the target is supposed to
+    stay at its height.
     """
     de, dn = x[0] - plot.site[0], x[1] - plot.site[1]
     distance = max(math.hypot(de, dn), LEAST_DISTANCE_M)
     ue, un = de / distance, dn / distance
-    along = x[2] * ue + x[3] * un
-    h[0] = plot.level * (x[2] - along * ue) / distance
-    h[1] = plot.level * (x[3] - along * un) / distance
+    ve, vn = x[2] - plot.site_velocity[0], x[3] - plot.site_velocity[1]
+    along = ve * ue + vn * un
+    h[0] = plot.level * (ve - along * ue) / distance
+    h[1] = plot.level * (vn - along * un) / distance
     h[2], h[3] = plot.level * ue, plot.level * un
     return float(plot.level * along)
 

@@ -89,11 +89,18 @@ def state_distances(
 def local_density(x: FloatArray, others: FloatArray, radius_m: float) -> FloatArray:
     """Other tracks a square metre around each of x (n, >= 2): those within ``radius_m``, at least one."""
     rho = np.empty(len(x))
+    n = len(others)
+    order = np.argsort(others[:, 0])
+    east, north = np.empty(n), np.empty(n)
+    for j in range(n):
+        east[j], north[j] = others[order[j], 0], others[order[j], 1]
     for i in range(len(x)):
         count = 0
-        for j in range(len(others)):
-            de, dn = x[i, 0] - others[j, 0], x[i, 1] - others[j, 1]
+        j = int(np.searchsorted(east, x[i, 0] - radius_m))
+        while j < n and east[j] <= x[i, 0] + radius_m:
+            de, dn = x[i, 0] - east[j], x[i, 1] - north[j]
             count += de * de + dn * dn < radius_m * radius_m
+            j += 1
         rho[i] = max(count, 1) / (np.pi * radius_m * radius_m)
     return rho
 

@@ -1,7 +1,8 @@
-"""Plots as the filters take them: positions in the plane with their covariance, and range rates where known."""
+"""Plots as the filters take them: positions in the plane with their covariance; range rates and heights where known."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
@@ -18,7 +19,9 @@ class Plot(Protocol):
         z: (2,) [east_m, north_m]. R: (3,) its covariance [ee, en, nn] in m^2.
         t_s: when. sensor: index of who measured it.
         range_rate_mps: growth of the slant range; range_rate_variance: its variance, infinite where it is unknown.
-        site: (2,) where the sensor stands in the plane. level: cosine of the elevation under which it sees the plot.
+        site: (2,) where the sensor stood in the plane. site_velocity: (2,) how it moved itself.
+        level: cosine of the elevation under which it sees the plot.
+        height_m: of the target; height_variance_m2: its variance, infinite where it is unknown.
     """
 
     z: FloatArray
@@ -28,12 +31,19 @@ class Plot(Protocol):
     range_rate_mps: float
     range_rate_variance: float
     site: FloatArray
+    site_velocity: FloatArray
     level: float
+    height_m: float
+    height_variance_m2: float
 
 
 Plots: TypeAlias = npt.NDArray[Any]
 """Many plots: an array of records with the fields of ``Plot``."""
 
+Move: TypeAlias = Callable[[Plots], FloatArray]
+"""Where plots (m,) belong instead: positions (m, 2)."""
+
+# Tracks remember many plots: what few sensors measure is kept in half the bytes.
 _PLOT = np.dtype(
     (
         np.record,
@@ -45,14 +55,17 @@ _PLOT = np.dtype(
             ("range_rate_mps", "f8"),
             ("range_rate_variance", "f8"),
             ("site", "f8", (2,)),
+            ("site_velocity", "f4", (2,)),
             ("level", "f8"),
+            ("height_m", "f4"),
+            ("height_variance_m2", "f4"),
         ],
     )
 )
 
 
 def make_plots(z: npt.ArrayLike, R: npt.ArrayLike, t_s: npt.ArrayLike, sensor: int = 0) -> Plots:
-    """Plots without range rate.
+    """Plots without range rate or height.
 
     Args:
         z: (m, 2). R: (m, 3). t_s: (m,), or one time for all.
@@ -67,6 +80,6 @@ def make_plots(z: npt.ArrayLike, R: npt.ArrayLike, t_s: npt.ArrayLike, sensor: i
 def empty_plots(shape: tuple[int, ...]) -> Plots:
     """Plots of which nothing is known."""
     plots = np.zeros(shape, _PLOT)
-    plots["range_rate_variance"] = np.inf
+    plots["range_rate_variance"] = plots["height_variance_m2"] = np.inf
     plots["level"] = 1.0
     return plots

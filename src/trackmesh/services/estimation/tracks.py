@@ -19,6 +19,7 @@ from trackmesh.services.estimation import gating, imm, printed
 from trackmesh.services.estimation.bank import Models, States, as_array, make_states, make_work
 from trackmesh.services.estimation.gating import Mixture, Strength
 from trackmesh.services.estimation.jit import kernel
+from trackmesh.services.estimation.joint import Odds, Pairs, soften
 from trackmesh.services.estimation.plots import Plot, Plots, empty_plots
 
 FloatArray = npt.NDArray[np.float64]
@@ -209,13 +210,22 @@ def _predict_one(f: Filters, i: int, t_s: float, place: int, out: Mixture, k: in
 
 @kernel
 def associate(
-    f: Filters, rows: IntArray, first: BoolArray, plots: Plots, limit: float, strength: Strength
+    f: Filters,
+    rows: IntArray,
+    first: BoolArray,
+    plots: Plots,
+    limit: float,
+    strength: Strength,
+    odds: Odds,
+    tally: IntArray,
 ) -> tuple[IntArray, FloatArray, BoolArray]:
     """Find out which row each plot is of, one to one, and feed it to that row.
 
     Args:
         rows: rows to choose from. first: (all rows,) those that choose before the others.
         plots: (m,). limit: of the gate. strength: of the targets.
+        odds: unless empty, rows of ``first`` that are close are fed weighted means of plots (see ``joint``).
+        tally: (2,) counted up by ``joint.soften``.
 
     Returns:
         (m,) the row of each plot or -1, the cost of the pair (see ``gating.gate``), and whether the row could still
@@ -236,7 +246,9 @@ def associate(
             count += 1
     near, times = near[:count], times[:count]
     ahead = Mixture(out.x[:count], out.P[:count], out.mu[:count])
-    chosen = gating.choose(ahead, times, first[near], plots, limit, cost)
+    pairs = Pairs(*gating.gate(ahead, times, plots, limit))
+    chosen = gating.choose_among(pairs.track, pairs.plot, pairs.cost, first[near], cost)
+    plots = soften(ahead, times, pairs, chosen, first[near], plots, odds, tally)
     # Where a transition matrix is learnt from, or the past refined, an update needs more than the predicted state.
     direct = _predicted_state_is_enough(f)
     for j in range(m):

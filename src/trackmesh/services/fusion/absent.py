@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import NamedTuple
 
 from trackmesh.protocol.messages import TrackFrame
@@ -20,6 +21,22 @@ class Absent:
     def __init__(self, wait_s: float) -> None:
         self._wait_ns = round(wait_s * 1e9)
         self._known: dict[tuple[str, int], _One] = {}
+
+    def kept(self) -> str:
+        """All of them, a line each, for ``restore``."""
+        return "\n".join(
+            json.dumps([*key, one.link, one.until_ns, one.words.model_dump_json()]) for key, one in self._known.items()
+        )
+
+    def restore(self, lines: str) -> None:
+        """Go on with what an earlier run had ``kept``.
+
+        Raises:
+            ValueError: it is none.
+        """
+        for line in lines.splitlines():
+            unit, ident, link, until_ns, words = json.loads(line)
+            self._known[unit, ident] = _One(link, until_ns, TrackFrame.model_validate_json(words))
 
     def lose(self, unit: str, rows: Rows, words: TrackFrame) -> None:
         """One track is silent; ``words`` is what has to be told should it not come back."""

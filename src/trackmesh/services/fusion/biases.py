@@ -158,13 +158,24 @@ def numbers(value: Any, shape: tuple[int, ...], name: str) -> FloatArray:
     return result
 
 
-def moved(change: Change, at: FloatArray) -> FloatArray:
+def moved(change: Change, at: FloatArray, site_m: FloatArray | None = None) -> FloatArray:
     """Positions (n, 2) that were corrected by ``change.before``, as ``change.after`` corrects them.
 
-    ``at`` is (n, 2), or (n, 4) with velocities: without them time offsets are left out.
+    Args:
+        change: what has changed.
+        at: (n, 2), or (n, 4) with velocities: without them time offsets are left out.
+        site_m: (n, 2) from where each was measured, if that was not where the sensor stands now.
     """
-    raw = bias.corrected(change.geometry, at, -change.before)
-    return bias.corrected(change.geometry, np.concatenate([raw, at[:, 2:]], axis=1), change.after)
+    raw = at[:, :2] - shift_from(change.geometry, site_m, at, -change.before)
+    return np.asarray(raw - shift_from(change.geometry, site_m, np.concatenate([raw, at[:, 2:]], axis=1), change.after))
+
+
+def shift_from(geometry: Geometry, site_m: FloatArray | None, at: FloatArray, biases: FloatArray) -> FloatArray:
+    """``bias.shift`` of positions (n, 2 or 4) measured from sites (n, 2); None: from that of the geometry."""
+    if site_m is None:
+        return bias.shift(geometry, at, biases)
+    off = np.concatenate([at[:, :2] - site_m, at[:, 2:]], axis=1)
+    return bias.shift(Geometry(geometry.polar, np.zeros(2)), off, biases)
 
 
 # --- what cannot be told ---

@@ -36,6 +36,7 @@ class Clutter:
     """
 
     def __init__(self, site: FloatArray | None, max_range_m: float, declared: float | None, areas: bool) -> None:
+        self._max_range_m = max_range_m
         self._area_m2 = float(np.pi * max_range_m**2)
         self._floor = 0.5 / self._area_m2
         self._plots = (declared or 0.0) * self._area_m2
@@ -56,6 +57,18 @@ class Clutter:
             self._looks = self._looks * keep + share_of_look
             _count(self._cells, keep, self._corner, self._cell_m, plots, explained)
 
+    def follow(self, site: FloatArray) -> None:
+        """The middle of the coverage has moved: what was counted stays where it was, as far as it is still covered."""
+        if self._covered_m2 is None:
+            return
+        steps = np.rint((site - self._max_range_m - self._corner) / self._cell_m).astype(np.int64)
+        if not steps.any():
+            return
+        self._corner = self._corner + steps * self._cell_m
+        old, self._cells = self._cells, np.zeros((_CELLS, _CELLS))
+        (to_i, from_i), (to_j, from_j) = (_overlap(int(step)) for step in steps)
+        self._cells[to_i, to_j] = old[from_i, from_j]
+
     def whole(self, plots_now: int = 0, share_of_look: float = 1.0) -> float:
         """The density over all, 1/m^2; before any batch was counted, that of the batch at hand."""
         if self._area_seen_m2 == 0.0:
@@ -71,12 +84,21 @@ class Clutter:
 
     def kept(self) -> dict[str, npt.NDArray[np.float64]]:
         """What is to be known after a restart."""
-        return {"whole": np.array([self._plots, self._area_seen_m2, self._looks]), "cells": self._cells.copy()}
+        whole = np.array([self._plots, self._area_seen_m2, self._looks])
+        return {"whole": whole, "cells": self._cells.copy(), "corner": self._corner.copy()}
 
     def restore(self, arrays: dict[str, npt.NDArray[np.float64]]) -> None:
         """Go on with what ``kept`` gave."""
         self._plots, self._area_seen_m2, self._looks = arrays["whole"].tolist()
         self._cells[:] = arrays["cells"]
+        self._corner[:] = arrays["corner"]
+
+
+def _overlap(step: int) -> tuple[slice, slice]:
+    """Cells of a row moved on by ``step`` that lie in the old row, and which those were."""
+    kept = max(_CELLS - abs(step), 0)
+    ahead, behind = slice(max(step, 0), max(step, 0) + kept), slice(max(-step, 0), max(-step, 0) + kept)
+    return behind, ahead
 
 
 def _covered(cells: int) -> FloatArray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from trackmesh.protocol.messages import COASTING, CONFIRMED, ENDED, TrackFrame
+from trackmesh.protocol.messages import COASTING, CONFIRMED, ENDED, UNKNOWN_HEIGHT_M2, TrackFrame
 from trackmesh.services.estimation.intersection import intersect
 from trackmesh.services.estimation.lookup import index_of
 from trackmesh.services.fusion import frames
@@ -18,6 +18,9 @@ from trackmesh.services.fusion.inputs import Inputs
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+
+_CLIMB_MPS = 10.0
+"""How targets climb, one sigma, while their height is not told again."""
 
 _SILENT_SHARE = 1.0 / 3.0
 """A track not told for this share of ``coast_s`` coasts."""
@@ -50,6 +53,7 @@ class Composition:
         status = frame.status.copy()
         updated, first = frame.updated_t_ns.copy(), frame.first_t_ns.copy()
         members = np.full((len(numbers), len(banks)), -1, np.int64)
+        height, variance = _heights(frame)
         for k, bank in enumerate(banks.values()):
             which = index_of(bank.rows.partner, numbers)
             have = np.flatnonzero(which >= 0)
@@ -57,11 +61,17 @@ class Composition:
             members[have, k] = theirs.ident
             updated[have] = np.maximum(updated[have], theirs.updated_ns)
             first[have] = np.minimum(first[have], theirs.first_ns)
+            their_variance = theirs.height_m2 + (_CLIMB_MPS * (t_s - theirs.t_s)) ** 2
+            better = their_variance < variance[have]
+            height[have[better]], variance[have[better]] = theirs.height_m[better], their_variance[better]
             fresh = have[~self._coasting(theirs, t_s)]
             status[fresh] = np.where(status[fresh] == COASTING, CONFIRMED, status[fresh])
+        known = bool((variance < UNKNOWN_HEIGHT_M2).any())
         return frame.model_copy(
             update={
                 "status": status,
+                "height_m": height if known else None,
+                "height_variance_m2": variance if known else None,
                 "sensors": [*banks, *frame.sensors],
                 "members": np.concatenate([members, frame.members], axis=1),
                 "updated_t_ns": updated,
@@ -94,6 +104,8 @@ class Composition:
                 "status": np.where(self._coasting(rows, t_s), COASTING, CONFIRMED).astype(np.uint8),
                 "state": state,
                 "covariance": covariance,
+                "height_m": rows.height_m,
+                "height_variance_m2": rows.height_m2,
                 "model_probability": np.zeros((n, len(blank.models))),
                 "manoeuvre_fit": None if blank.manoeuvre_fit is None else rows.fit,
                 "sensors": blank.sensors[len(self._inputs.banks) :],
@@ -108,3 +120,11 @@ class Composition:
 
     def _coasting(self, rows: Rows, t_s: float) -> npt.NDArray[np.bool_]:
         return np.asarray(rows.coasting | (t_s - rows.t_s > _SILENT_SHARE * self._inputs.rules.coast_s))
+
+
+def _heights(frame: TrackFrame) -> tuple[FloatArray, FloatArray]:
+    """Heights (n,) and variances (n,) of a frame, to be written."""
+    if frame.height_m is None or frame.height_variance_m2 is None:
+        n = len(frame.track_id)
+        return np.zeros(n), np.full(n, UNKNOWN_HEIGHT_M2)
+    return frame.height_m.copy(), frame.height_variance_m2.copy()

@@ -38,11 +38,6 @@ class Corrections:
                 prior[2] = 0.0
             self.biases.announce(info.sensor_id, kind, site_m, prior)
 
-    def announce_reference(self, name: str, error_m: float) -> None:
-        """Take note of a unit whose positions are right but for this error, one sigma per axis."""
-        if self.biases is not None:
-            self.biases.announce(name, "position", prior=(error_m, error_m, 0.0))
-
     def correct(self, plots: Plots) -> Plots:
         """Plots of one or more sensors, each corrected by what is applied to its sensor."""
         if self.biases is None or not any(self.biases.locked(sensor_id) for sensor_id in self._ids):
@@ -57,7 +52,8 @@ class Corrections:
         if self.biases is None or not self.biases.locked(self._ids[index]):
             return plots
         out = plots.copy()
-        out["z"][which] -= self.biases.shift(self._ids[index], plots["z"][which])
+        # From where each was measured: a sensor that moves has moved on since.
+        out["z"][which] -= self.biases.shift(self._ids[index], plots["z"][which], site_m=plots["site"][which])
         out["t_s"][which] += self.biases.time_offset_s(self._ids[index])
         return out
 

@@ -43,10 +43,11 @@ class Declared(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """Tracks of a unit whose positions are taken to be right."""
+    """Tracks of a unit whose positions are taken to be right but for this error, one sigma per axis."""
 
     name: str
     tracks: LocalTracks
+    error_m: float
 
 
 class AssociationCycle:
@@ -78,7 +79,7 @@ class AssociationCycle:
     def run(self, sensors: list[str], now_s: float, references: Sequence[Reference] = ()) -> list[Change]:
         """One cycle at a time; what changed in the corrections that are applied to plots.
 
-        ``references`` are no sensors of ours, but known to the registration: it learns from their tracks as well.
+        The registration learns from the tracks of ``references`` as well.
         """
         for sensor, local in enumerate(self._locals):
             # The tracks of a sensor that fell silent end here: it steps no more.
@@ -98,12 +99,24 @@ class AssociationCycle:
                 if found is not None:
                     self.declared.append(Declared(a, b, seen[a].row[found.a], seen[b].row[found.b]))
                 self._join(a, b, seen[a].number[pairs.a], seen[b].number[pairs.b], now_s)
-        for one in references:
-            for a, name in enumerate(sensors):
-                test = self._reference_tests.setdefault((name, one.name), self._new_test())
-                pairs = test.cycle(seen[a], one.tracks, now_s, self._blur(name, one.name))
-                self._teach(name, one.name, seen[a], one.tracks, pairs, now_s)
+        if self._registration is not None:
+            self._compare(sensors, seen, references, self._registration, now_s)
         return self._registration.settle(now_s) if self._registration else []
+
+    def _compare(
+        self,
+        sensors: list[str],
+        seen: list[LocalTracks],
+        references: Sequence[Reference],
+        known: Registration,
+        now_s: float,
+    ) -> None:
+        for one in references:
+            known.announce(one.name, "position", prior=(one.error_m, one.error_m, 0.0))
+            for name, tracks in zip(sensors, seen, strict=True):
+                test = self._reference_tests.setdefault((name, one.name), self._new_test())
+                pairs = test.cycle(tracks, one.tracks, now_s, self._blur(name, one.name))
+                self._teach(name, one.name, tracks, one.tracks, pairs, now_s)
 
     def _local_tracks(self, local: Layer, sensor_id: str, now_s: float) -> LocalTracks:
         rows = local.rows
@@ -165,7 +178,7 @@ class AssociationCycle:
             self._counters["contradictions"] += 1
             return
         old, young = sorted((one, other), key=lambda row: int(known.link[row]))
-        filters.feed_from(young, old)
+        self._system.join(young, old)
         free = known.member[old] < 0
         known.member[old][free] = known.member[young][free]
         known.last_s[old] = max(known.last_s[old], known.last_s[young])

@@ -29,7 +29,7 @@ from trackmesh.services.fusion.biases import Change, moved
 from trackmesh.services.fusion.clutter import Clutter
 from trackmesh.services.fusion.composition import Composition
 from trackmesh.services.fusion.corrections import Corrections
-from trackmesh.services.fusion.cycle import AssociationCycle, Reference
+from trackmesh.services.fusion.cycle import AssociationCycle
 from trackmesh.services.fusion.inputs import Inputs
 from trackmesh.services.fusion.layer import Layer, Look
 from trackmesh.services.fusion.life import Rules
@@ -48,7 +48,7 @@ IntArray = npt.NDArray[np.int64]
 _TENTATIVE_AGE_PERIODS = 2.2
 _SEEN_LATELY_PERIODS = 5.0
 _JUDGED_SECTORS_LATE = 1.5
-_ROWS = 64
+_ROWS = 256
 
 
 class FusionEngine:
@@ -56,7 +56,7 @@ class FusionEngine:
 
     Attributes:
         corrections: what is known of the sensors' biases.
-        inputs: the units whose tracks it takes; None where there are none.
+        inputs: the units whose tracks it takes.
         counters: what happened, by name (``plots``, ``late_plots``, ``merged``, ``contradictions``, ...).
         sensors: by id, in the order in which they were first heard of.
         log_likelihood: of all plots so far under the picture, against clutter alone: the plots that tracks took by
@@ -72,7 +72,8 @@ class FusionEngine:
         self.sensors: dict[str, Sensor] = {}
         self.log_likelihood = 0.0
         self._time = Timeline()
-        self._system = Layer(settings.system_tracks(_ROWS), self._rules(1.0, settings.coast_s), 1, settings.gate)
+        rules = self._rules(1.0, settings.coast_s)
+        self._system = Layer(settings.system_tracks(_ROWS), rules, 1, settings.gate, settings.height_tracks())
         self._locals: list[Layer] = []
         self.corrections = Corrections(
             settings.registration_rules() if settings.registration else None, settings.right_clocks
@@ -83,11 +84,9 @@ class FusionEngine:
         )
         self._picture = Picture(settings, unit, self._system, self.sensors, self._time)
         self._picture.origin = origin
-        self.inputs: Inputs | None = None
-        if inputs:
-            rules = settings.input_rules()
-            self.inputs = Inputs(inputs, unit.unit_id, rules, self._system, self._picture, self.counters)
-            self._picture.composition = Composition(self.inputs)
+        expected = settings.input_rules()
+        self.inputs = Inputs(inputs, unit.unit_id, expected, self._system, self._picture, self._time, self.counters)
+        self._picture.composition = Composition(self.inputs) if inputs else None
         self._stitching = Stitching(self._system, settings.stitch_s, settings.stitch_q_m2ps3)
         self._cycle_s = -np.inf
         self._frame_s = -np.inf
@@ -109,7 +108,10 @@ class FusionEngine:
             return
         self._settle(info.site)
         index = old.index if old else len(self.sensors)
-        sensor = Sensor(index, info, self.origin, clutter_areas=self.settings.clutter_areas)
+        s = self.settings
+        sensor = Sensor(index, info, self.origin, clutter_areas=s.clutter_areas, noise_model=s.noise_model)
+        if old is not None:
+            sensor.take_over(old)
         self.sensors[info.sensor_id] = sensor
         self.corrections.announce(sensor.index, info, sensor.site)
         longest = max(s.info.period_s for s in self.sensors.values())
@@ -142,13 +144,10 @@ class FusionEngine:
         Raises:
             RefusedMessage: the unit is no input, or its frame is wrong (see ``Inputs.read``).
         """
-        if self.inputs is None:
-            raise RefusedMessage("unknown_input", f"The unit {frame.unit_id} is no input of this one.")
         told = self.inputs.read(frame)
         self._settle(frame.origin)
-        t_s = self._time.to_s(frame.t_ns)
-        self._time.advance(t_s)
-        self.inputs.tell(frame, told, self.origin, t_s, self._time.to_ns(self._time.now_s))
+        self._time.advance(self._time.to_s(frame.t_ns))
+        self.inputs.tell(frame, told, self.origin)
         return self._pass_time()
 
     def tick(self, t_ns: int) -> TrackFrame | None:
@@ -203,6 +202,8 @@ class FusionEngine:
             arrays |= named(f"local/{sensor.index}", local.kept())
             arrays |= named(f"clutter/{sensor.index}/local", sensor.local_clutter.kept())
             arrays |= named(f"clutter/{sensor.index}/system", sensor.system_clutter.kept())
+            arrays |= {f"stood/{sensor.index}": sensor.where_it_stood()}
+        arrays |= named("inputs", self.inputs.kept())
         numbers = {"epoch_ns": self._time.epoch_ns, "next_track": self._picture.next_track}
         return Snapshot(
             t_ns=now_ns,
@@ -239,10 +240,13 @@ class FusionEngine:
             self.sensor(info)
         self._system.restore(under("system", kept.arrays))
         self._stitching.restore(under("lost", kept.arrays))
+        self.inputs.restore(under("inputs", kept.arrays))
         for sensor, local in zip(self.sensors.values(), self._locals, strict=True):
             local.restore(under(f"local/{sensor.index}", kept.arrays))
             sensor.local_clutter.restore(under(f"clutter/{sensor.index}/local", kept.arrays))
             sensor.system_clutter.restore(under(f"clutter/{sensor.index}/system", kept.arrays))
+            sensor.stands_again(kept.arrays[f"stood/{sensor.index}"])
+            self.corrections.announce(sensor.index, sensor.info, sensor.site)
         self.counters["restored"] = int(self._system.life.confirmed[self._system.rows].sum())
 
     def figures(self) -> dict[str, float]:
@@ -255,19 +259,23 @@ class FusionEngine:
             "pairs": sum(len(d.row_a) for d in self._cycle.declared),
         }
         out |= {f"local_tracks.{s.info.sensor_id}": len(self._locals[s.index].rows) for s in self.sensors.values()}
-        out |= self.inputs.figures() if self.inputs else {}
-        return {name: float(value) for name, value in out.items()}
+        out |= self.inputs.figures()
+        return {name: float(value) for name, value in (out | self._system.filters.figures()).items()}
 
     # --- one batch ---
 
     def _take(self, sensor: Sensor, batch: PlotBatch, plots: Plots) -> None:
-        self._time.advance(float(plots["t_s"].max()))
-        fresh = plots["t_s"] >= self._time.now_s - self.settings.max_lateness_s
+        t_s = plots["t_s"]
+        self._time.advance(float(t_s.max()))
         self.counters["plots"] += len(plots)
-        self.counters["too_late_plots"] += int(len(plots) - fresh.sum())
-        if not fresh.any():
-            return
-        plots = plots[fresh]
+        oldest_s = self._time.now_s - self.settings.max_lateness_s
+        if t_s.min() < oldest_s:
+            self.counters["too_late_plots"] += int((t_s < oldest_s).sum())
+            plots = plots[t_s >= oldest_s]
+            if not len(plots):
+                return
+        if sensor.stood(plots["site"][0], float(plots["t_s"].max())):
+            self.corrections.announce(sensor.index, sensor.info, sensor.site)
         sectors = batch.scan.sectors if batch.scan else 1
         local = self._locals[sensor.index]
         look = self._look(sensor, 0, plots, sectors, sensor.local_clutter)
@@ -279,7 +287,6 @@ class FusionEngine:
         sensor.system_clutter.add(plots, fed.by_confirmed, 1.0 / sectors)
         self.log_likelihood += fed.log_likelihood
         self.counters["late_plots"] += fed.late
-        self.counters["repairs"] = self._system.filters.repairs + sum(one.filters.repairs for one in self._locals)
         life.share(local.life, got.row, self._system.life.uid[fed.row])
         self._name(fed.confirmed)
         self._note_lost(fed.ended)
@@ -291,7 +298,7 @@ class FusionEngine:
         return Look(
             sensor=index,
             t_s=float(plots["t_s"].max()),
-            site=sensor.site,
+            site=plots["site"][0].copy(),
             max_range_m=info.max_range_m,
             period_s=info.period_s,
             p_detect=info.p_detect,
@@ -304,22 +311,22 @@ class FusionEngine:
 
     def _name(self, rows: IntArray) -> None:
         """Give newly confirmed system tracks their public numbers: those of lost tracks that they continue, or new."""
+        if not len(rows):
+            return
         taken, numbers, dropped = self._stitching.take_over(rows, self._time.now_s)
         self._system.life.link[taken] = numbers
         for row in dropped.tolist():
             self._system.drop(row)
-        if self.inputs is not None and len(rows) and self.inputs.shown:
+        if self.inputs.shown:
             # What stands in the picture as a foreign track has an id already.
-            self.inputs.cycle(self._time.now_s, regular=False)
+            self.inputs.cycle(regular=False)
         self._picture.name(rows[self._system.life.link[rows] < 0])
         self.counters["confirmed"] += len(rows) - len(taken)
         self.counters["stitched"] += len(taken)
 
     def _note_lost(self, ended: list[tuple[int, int, int]]) -> None:
         """Rows had no plot for too long; and tell of those of earlier whose time is over."""
-        if self.inputs is not None and ended:
-            self.inputs.expire(self._time.to_ns(self._time.now_s))
-            ended = self.inputs.heirs_of(ended)
+        ended = self.inputs.without_heir(ended)
         if ended:
             rows = np.array([row for row, _, _ in ended], np.int64)
             self._stitching.lose(rows, self._picture.last_words(rows))
@@ -333,19 +340,11 @@ class FusionEngine:
         if self._time.now_s - self._cycle_s < self.settings.cycle_s:
             return
         self._cycle_s = self._time.now_s
+        self.counters["repairs"] = self._system.filters.repairs + sum(one.filters.repairs for one in self._locals)
         self._registration_due = self.settings.registration
-        for change in self._cycle.run(list(self.sensors), self._time.now_s, self._references()):
+        for change in self._cycle.run(list(self.sensors), self._time.now_s, self.inputs.references()):
             self._correct(change)
-        if self.inputs is not None:
-            self.inputs.cycle(self._time.now_s)
-
-    def _references(self) -> list[Reference]:
-        if self.inputs is None or not self.settings.input_reference or self.corrections.biases is None:
-            return []
-        found = self.inputs.references(self._time.now_s)
-        for one in found:
-            self.corrections.announce_reference(one.name, self.settings.input_error_m)
-        return found
+        self.inputs.cycle()
 
     def _correct(self, change: Change) -> None:
         """Plots of a sensor are corrected otherwise from now on: move what the system tracks remember of it along."""
@@ -355,7 +354,7 @@ class FusionEngine:
         else:
             index = self.sensors[change.sensor_id].index
             later_s = float(change.before[2] - change.after[2])
-            self._system.filters.move_plots(index, lambda z: moved(change, z), -later_s)
+            self._system.filters.move_plots(index, lambda plots: moved(change, plots["z"], plots["site"]), -later_s)
 
     def _restart(self) -> None:
         """Make the picture anew from the local tracks: the tracks so far were of plots that did not fit each other."""
@@ -380,8 +379,7 @@ class FusionEngine:
         if self._time.epoch_ns is None or self._time.now_s - self._frame_s < period_s:
             return None
         self._frame_s = self._time.now_s
-        if self.inputs is not None:
-            self.inputs.expire(self._time.to_ns(self._time.now_s))
+        self.inputs.expire()
         return self._picture.next_frame()
 
     def _settle(self, origin: Geodetic | None) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from trackmesh.protocol.errors import RefusedMessage
-from trackmesh.protocol.messages import COASTING, CONFIRMED, ENDED, Geodetic, TrackFrame
+from trackmesh.protocol.messages import COASTING, CONFIRMED, ENDED, UNKNOWN_HEIGHT_M2, Geodetic, TrackFrame
 from trackmesh.services.estimation.jit import kernel
 from trackmesh.services.fusion.plane import place
 
@@ -33,6 +33,7 @@ class Told(NamedTuple):
         updated_ns, first_ns: (n,) their last and first plots.
         coasting: (n,) whether the sender has no recent plot.
         fit: (n,) the sender's ``manoeuvre_fit``, 0 where it tells none.
+        height_m, height_m2: (n,) height and its variance, which is that of an unknown one where there is none.
         echo: (n,) whether the sender knows the track from us alone.
         ended: (k,) ids of those that ended.
     """
@@ -44,6 +45,8 @@ class Told(NamedTuple):
     first_ns: IntArray
     coasting: BoolArray
     fit: FloatArray
+    height_m: FloatArray
+    height_m2: FloatArray
     echo: BoolArray
     ended: IntArray
 
@@ -61,6 +64,7 @@ def read(frame: TrackFrame, our_unit: str) -> Told:
     updated_ns = frame.updated_t_ns[keep]
     _check(frame, ident, x, P, updated_ns)
     P[:, range(4), range(4)] *= 1.0 + _SLACK
+    height, variance = _heights(frame)
     return Told(
         ident=ident,
         x=x,
@@ -69,6 +73,8 @@ def read(frame: TrackFrame, our_unit: str) -> Told:
         first_ns=frame.first_t_ns[keep],
         coasting=frame.status[keep] == COASTING,
         fit=np.zeros(len(ident)) if frame.manoeuvre_fit is None else frame.manoeuvre_fit[keep],
+        height_m=height[keep],
+        height_m2=variance[keep],
         echo=_only_from(frame, our_unit)[keep],
         ended=frame.track_id[frame.status == ENDED],
     )
@@ -99,6 +105,13 @@ def _check(frame: TrackFrame, ident: IntArray, x: FloatArray, P: FloatArray, upd
         raise RefusedMessage("duplicate_track", f"A frame of {unit} tells one track twice.")
     if (updated_ns > frame.t_ns).any():
         raise RefusedMessage("future_update", f"A track of {unit} has a last plot after the time of its frame.")
+
+
+def _heights(frame: TrackFrame) -> tuple[FloatArray, FloatArray]:
+    n = len(frame.track_id)
+    if frame.height_m is None or frame.height_variance_m2 is None:
+        return np.zeros(n), np.full(n, UNKNOWN_HEIGHT_M2)
+    return frame.height_m, np.minimum(frame.height_variance_m2, UNKNOWN_HEIGHT_M2)
 
 
 def _only_from(frame: TrackFrame, our_unit: str) -> BoolArray:

@@ -7,7 +7,15 @@ import numpy.typing as npt
 import pymap3d
 
 from trackmesh.protocol.errors import RefusedMessage
-from trackmesh.protocol.messages import COASTING, CONFIRMED, TENTATIVE, Geodetic, TrackFrame, TrackQuery
+from trackmesh.protocol.messages import (
+    COASTING,
+    CONFIRMED,
+    TENTATIVE,
+    UNKNOWN_HEIGHT_M2,
+    Geodetic,
+    TrackFrame,
+    TrackQuery,
+)
 from trackmesh.services.estimation.jit import kernel
 from trackmesh.services.fusion.layer import Layer
 
@@ -46,6 +54,17 @@ def manoeuvre_fit(mu: FloatArray, models: int) -> FloatArray | None:
     return np.minimum(mu[:, :models].sum(axis=1), 1.0) if models else None
 
 
+def heights(layer: Layer, rows: IntArray, t_s: float) -> tuple[FloatArray | None, FloatArray | None]:
+    """Heights (n,) and variances (n,) of rows as frames tell them; None where no row has one."""
+    if layer.heights is None:
+        return None, None
+    height, variance = layer.heights.estimate(rows, layer.life.uid[rows], t_s)
+    unknown = ~(variance < UNKNOWN_HEIGHT_M2)
+    if unknown.all():
+        return None, None
+    return np.where(unknown, 0.0, height), np.where(unknown, UNKNOWN_HEIGHT_M2, variance)
+
+
 def select(frame: TrackFrame, query: TrackQuery) -> TrackFrame:
     """The part of a frame that a query asks for.
 
@@ -74,6 +93,8 @@ _PER_TRACK = (
     "status",
     "state",
     "covariance",
+    "height_m",
+    "height_variance_m2",
     "model_probability",
     "manoeuvre_fit",
     "members",
@@ -85,12 +106,24 @@ _PER_TRACK = (
 def join(frame: TrackFrame, others: list[TrackFrame]) -> TrackFrame:
     """The frame with the tracks of others behind its own; all of one unit and set of sensors."""
     sensors = len(frame.sensors)
+    parts = _alike([frame, *others])
     return frame.model_copy(
         update={
-            name: np.concatenate([_widened(getattr(f, name), name, sensors) for f in (frame, *others)])
-            for name in _given(frame)
+            name: np.concatenate([_widened(getattr(f, name), name, sensors) for f in parts])
+            for name in _given(parts[0])
         }
     )
+
+
+def _alike(parts: list[TrackFrame]) -> list[TrackFrame]:
+    """Where some frames have heights, the others have unknown ones."""
+    if all(f.height_m is None for f in parts):
+        return parts
+    return [f if f.height_m is not None else f.model_copy(update=_no_heights(len(f.track_id))) for f in parts]
+
+
+def _no_heights(n: int) -> dict[str, FloatArray]:
+    return {"height_m": np.zeros(n), "height_variance_m2": np.full(n, UNKNOWN_HEIGHT_M2)}
 
 
 def _given(frame: TrackFrame) -> list[str]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +27,8 @@ from trackmesh.services.fusion.foreign import NOBODY, ForeignTracks, Rows
 from trackmesh.services.fusion.foreign_frames import Told, moved, read
 from trackmesh.services.fusion.layer import Layer
 from trackmesh.services.fusion.pair_tests import PairTest
-from trackmesh.services.streams import Streams
+from trackmesh.services.fusion.timeline import Timeline
+from trackmesh.services.streams import Stream, Streams
 
 IntArray = npt.NDArray[np.int64]
 
@@ -45,6 +46,7 @@ class InputRules(NamedTuple):
         wait_s: how long after its last plot the id of a silent one is kept for it.
         q_m2ps3: acceleration noise under which their tracks are predicted.
         error_m: error of their positions that their covariances do not know, one sigma per axis.
+        reference: whether they are right but for that, so that sensors can be corrected by them.
         new_test: makes a test of pairs.
     """
 
@@ -52,11 +54,16 @@ class InputRules(NamedTuple):
     wait_s: float
     q_m2ps3: float
     error_m: float
+    reference: bool
     new_test: Callable[[], PairTest]
 
 
 class Board(Protocol):
     """The picture, as far as it is needed here."""
+
+    @property
+    def lowest_id(self) -> int:
+        """No track of ours has a lower public id, and no unit of a lower number has a higher one."""
 
     def numbers(self, n: int) -> IntArray:
         """Public ids (n,) never used before."""
@@ -99,14 +106,16 @@ class Inputs:
         rules: InputRules,
         system: Layer,
         board: Board,
+        time: Timeline,
         counters: Counter[str],
     ) -> None:
         self.rules = rules
-        self.banks = {unit: ForeignTracks(rules.coast_s, rules.error_m) for unit in units}
+        self.banks = {unit: ForeignTracks(rules.coast_s, rules.error_m, self._new_numbers) for unit in units}
         self.streams = Streams()
         self._our_unit = our_unit
         self._system = system
         self._board = board
+        self._time = time
         self._counters = counters
         self._tests = [rules.new_test() for _ in units]
         self._absent = Absent(rules.wait_s)
@@ -125,6 +134,33 @@ class Inputs:
             out[f"input_tracks.{unit}"] = len(bank.rows.ident)
             out[f"input_pairs.{unit}"] = int((bank.rows.partner >= 0).sum())
         return out
+
+    def stream(self, unit: str) -> Stream:
+        """The sequence of frames of a unit, empty if it was never heard."""
+        return self.streams.known.get(unit, Stream())
+
+    def kept(self) -> dict[str, npt.NDArray[Any]]:
+        """What has to be known to go on after a restart; nothing where there are no inputs."""
+        if not self.banks:
+            return {}
+        arrays = {f"{unit}/{name}": v for unit, bank in self.banks.items() for name, v in bank.rows._asdict().items()}
+        absent = np.frombuffer(self._absent.kept().encode(), np.uint8)
+        return arrays | {"next": np.array(self._next), "absent": absent}
+
+    def restore(self, arrays: dict[str, npt.NDArray[Any]]) -> None:
+        """Go on with what ``kept`` gave, as far as it is of units that are inputs still.
+
+        Raises:
+            KeyError, ValueError: it is none.
+        """
+        if not arrays:
+            return
+        for unit, bank in self.banks.items():
+            of_unit = {name.removeprefix(f"{unit}/"): v for name, v in arrays.items() if name.startswith(f"{unit}/")}
+            if of_unit:
+                bank.restore(of_unit)
+        self._next = int(arrays["next"])
+        self._absent.restore(arrays["absent"].tobytes().decode())
 
     # --- what they tell ---
 
@@ -145,25 +181,27 @@ class Inputs:
             raise RefusedMessage("old_frame", f"A frame of {unit} is older than the one before it.")
         self.streams.check(unit, frame.boot_id, frame.seq, np.full(len(frame.track_id), frame.t_ns), None)
         self.streams.known[unit].last_t_ns = frame.t_ns
-        if self._our_unit.unit_id in frame.sensors and (frame.track_id >> TRACK_BITS >= self._our_unit.number).any():
+        if self._our_unit in frame.sensors and (frame.track_id >= self._board.lowest_id).any():
             self._rings.add(unit)
         return told
 
-    def tell(self, frame: TrackFrame, told: Told, origin: Geodetic | None, t_s: float, now_ns: int) -> None:
-        """Take what a frame tells; ``t_s`` is its time, ``now_ns`` ours."""
+    def tell(self, frame: TrackFrame, told: Told, origin: Geodetic | None) -> None:
+        """Take what a frame tells, into the plane of ``origin``."""
         unit, bank = frame.unit_id, self.banks[frame.unit_id]
-        numbers = _NUMBERS | ((self._next + np.arange(len(told.ident))) & (_NUMBERS - 1))
-        self._next += len(told.ident)
         self._counters["input_frames"] += 1
-        self.expire(now_ns)
-        ended = bank.tell(moved(told, frame, origin), t_s, now_ns, numbers)
+        self.expire()
+        t_s, now_ns = self._time.to_s(frame.t_ns), self._time.to_ns(self._time.now_s)
+        ended = bank.tell(moved(told, frame, origin), t_s, now_ns)
         for i in self._without_heir(ended):
             self._board.tell([self._board.foreign_last_words(unit, ended.take(np.array([i])))])
         self._board.tell(self._absent.end(unit, told.ended.tolist()))
         self._welcome_back(unit, bank.rows)
 
-    def expire(self, now_ns: int) -> None:
-        """Let go tracks whose last plot is too old."""
+    def expire(self) -> None:
+        """Let go tracks whose last plot is too old by now."""
+        if not self.banks:
+            return
+        now_ns = self._time.to_ns(self._time.now_s)
         for unit, bank in self.banks.items():
             silent = bank.expire(now_ns)
             for i in self._without_heir(silent):
@@ -173,8 +211,11 @@ class Inputs:
 
     # --- who is whom ---
 
-    def cycle(self, now_s: float, regular: bool = True) -> None:
+    def cycle(self, regular: bool = True) -> None:
         """Run the tests; out of turn (not ``regular``) it does not count how long tracks are alone."""
+        if not self.banks:
+            return
+        now_s = self._time.now_s
         entries = self._system_entries(now_s)
         for k, (bank, test) in enumerate(zip(self.banks.values(), self._tests, strict=True)):
             given = _as_tracks(bank.rows, *bank.rows.at(now_s, self.rules.q_m2ps3))
@@ -182,26 +223,34 @@ class Inputs:
             self._note_partners(entries, bank.rows, pairs, regular)
             entries = _with_unpaired(entries, given, bank.rows, k)
 
-    def heirs_of(self, ended: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
+    def without_heir(self, ended: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
         """Let foreign tracks take over the ids of ended system tracks (row, uid, id); returns those nobody took."""
+        if not (self.banks and ended):
+            return ended
+        self.expire()
         left = []
         for row, uid, link in ended:
-            if self._hand_over(int(system_numbers(np.int64(uid))), link):
+            if self._hand_over(int(system_numbers(np.array(uid))), link):
                 self._counters["handed_over"] += 1
             else:
                 left.append((row, uid, link))
         return left
 
-    def references(self, now_s: float) -> list[Reference]:
-        """The tracks of each unit, but of two that take each other's only those of the one with the lower number.
+    def _new_numbers(self, n: int) -> IntArray:
+        self._next += n
+        return _NUMBERS | ((self._next - n + np.arange(n)) & (_NUMBERS - 1))
+
+    def references(self) -> list[Reference]:
+        """The tracks of each unit, where they are right; of two that take each other's those of the lower number only.
 
         Else both would follow each other.
         """
         found = []
-        for unit, bank in self.banks.items():
+        for unit, bank in self.banks.items() if self.rules.reference else ():
             rows = bank.rows.take(~bank.rows.coasting)
             if unit not in self._rings and len(rows.ident):
-                found.append(Reference(unit, _as_tracks(rows, *rows.at(now_s, self.rules.q_m2ps3))))
+                tracks = _as_tracks(rows, *rows.at(self._time.now_s, self.rules.q_m2ps3))
+                found.append(Reference(unit, tracks, self.rules.error_m))
         return found
 
     def _system_entries(self, now_s: float) -> _Entries:
@@ -287,6 +336,6 @@ def _with_unpaired(entries: _Entries, given: LocalTracks, rows: Rows, bank: int)
     alone = rows.partner < 0
     if not alone.any():
         return entries
-    more = LocalTracks(*(values[alone] for values in given))
+    more = LocalTracks._make(values[alone] for values in given)
     tracks = LocalTracks(*(np.concatenate(pair) for pair in zip(entries.tracks, more, strict=True)))
     return _Entries(tracks, np.concatenate([entries.bank, np.full(int(alone.sum()), bank, np.int64)]))

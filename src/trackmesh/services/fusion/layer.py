@@ -5,14 +5,15 @@ The same code keeps the local tracks of one sensor and the system tracks of all 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from trackmesh.services.estimation.gating import Mixture
-from trackmesh.services.estimation.plots import Plots
+from trackmesh.services.estimation.heights import HeightTracks
+from trackmesh.services.estimation.joint import Odds
+from trackmesh.services.estimation.plots import Move, Plots
 from trackmesh.services.fusion import life as lives
 from trackmesh.services.fusion.life import Life, Rules, make_life
 from trackmesh.services.fusion.snapshot import Arrays, fill, named, under
@@ -20,7 +21,6 @@ from trackmesh.services.fusion.snapshot import Arrays, fill, named, under
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
-Move = Callable[[FloatArray], FloatArray]
 
 
 class TrackFilters(Protocol):
@@ -34,12 +34,13 @@ class TrackFilters(Protocol):
     def mean(self) -> FloatArray: ...  # noqa: D102
     @property
     def repairs(self) -> int: ...  # noqa: D102
+    def figures(self) -> dict[str, int]: ...  # noqa: D102
 
     def begin(self, rows: IntArray, plots: Plots) -> None: ...  # noqa: D102
     def feed(self, rows: IntArray, plots: Plots) -> BoolArray: ...  # noqa: D102
     def feed_from(self, source: int, target: int) -> None: ...  # noqa: D102
     def associate(  # noqa: D102
-        self, rows: IntArray, first: BoolArray, plots: Plots, limit: float
+        self, rows: IntArray, first: BoolArray, plots: Plots, limit: float, odds: Odds
     ) -> tuple[IntArray, FloatArray, BoolArray]: ...
     def estimate(  # noqa: D102
         self, rows: IntArray, t_s: FloatArray
@@ -79,6 +80,11 @@ class Look(NamedTuple):
     clutter_density: FloatArray
     reference_density: float
 
+    @property
+    def log_miss(self) -> float:
+        """ln(1 - Pd), of a sensor that misses one in a thousand at least."""
+        return float(np.log(max(1.0 - self.p_detect, 1e-3)))
+
 
 class Step(NamedTuple):
     """What a step did.
@@ -101,10 +107,17 @@ class Step(NamedTuple):
 
 
 class Layer:
-    """A bank of tracks; rows never move while their track lives, uids are never used twice."""
+    """A bank of tracks; rows never move while their track lives, uids are never used twice.
 
-    def __init__(self, filters: TrackFilters, rules: Rules, sensors: int, gate: float) -> None:
+    Attributes:
+        heights: of the tracks, where this layer keeps them.
+    """
+
+    def __init__(
+        self, filters: TrackFilters, rules: Rules, sensors: int, gate: float, heights: HeightTracks | None = None
+    ) -> None:
         self.filters = filters
+        self.heights = heights
         self.rules = rules
         self.gate = gate
         self._next_uid = 0
@@ -115,7 +128,7 @@ class Layer:
     @property
     def rows(self) -> IntArray:
         """Rows of living tracks."""
-        return np.flatnonzero(self.life.alive)
+        return np.asarray(self.life.alive.nonzero()[0])
 
     def step(self, plots: Plots, look: Look, now_s: float) -> Step:
         """Take one batch: gate, assign, filter, score, start tentative tracks, judge misses, confirm and end.
@@ -129,6 +142,8 @@ class Layer:
             if len(alive):
                 row, by_confirmed, late, gained = self._associate(alive, plots, look)
             self._start(plots, look, row)
+            if self.heights is not None:
+                self.heights.feed(row, self.life.uid[row], plots)
         lost = self._miss(alive, look)
         confirmed, ended = self.judge(now_s)
         return Step(row, by_confirmed, confirmed, ended, late, gained + lost)
@@ -168,6 +183,8 @@ class Layer:
         for row, one, gain in zip(rows.tolist(), plots, score.tolist(), strict=True):
             rest = one[1:]
             self.filters.feed(np.full(len(rest), row), rest)
+            if self.heights is not None:
+                self.heights.feed(np.full(len(one), row), np.full(len(one), self.life.uid[row]), one)
             for k in range(len(one)):
                 plot = one[k : k + 1]
                 yes, nothing = np.ones(1, np.bool_), np.zeros(1)
@@ -175,6 +192,12 @@ class Layer:
             self.life.score[row] = self.life.best[row] = gain
         self.life.confirmed[rows] = True
         return rows
+
+    def join(self, young: int, old: int) -> None:
+        """The plots that one row remembers are those of another as well."""
+        self.filters.feed_from(young, old)
+        if self.heights is not None:
+            self.heights.feed_from(young, old, int(self.life.uid[young]), int(self.life.uid[old]))
 
     def drop(self, row: int) -> None:
         """End one track at once."""
@@ -186,7 +209,11 @@ class Layer:
         rows = self.rows
         held = {name: value[rows] for name, value in self.filters.arrays().items()}
         alive = {name: value[rows] for name, value in self.life._asdict().items()}
-        return named("filters", held) | named("life", alive) | {"next_uid": np.array(self._next_uid)}
+        heights = (
+            {name: value[rows] for name, value in self.heights.arrays(rows).items()} if self.heights is not None else {}
+        )
+        next_uid = {"next_uid": np.array(self._next_uid)}
+        return named("filters", held) | named("life", alive) | named("heights", heights) | next_uid
 
     def restore(self, arrays: Arrays) -> None:
         """Go on with what ``kept`` gave, in a layer without tracks.
@@ -200,6 +227,9 @@ class Layer:
             fill(target, rows, held, name)
         for name, target in self.life._asdict().items():
             fill(target, rows, alive, name)
+        if self.heights is not None:
+            for name, target in self.heights.arrays(rows).items():
+                fill(target, rows, under("heights", arrays), name)
         self._next_uid = int(arrays["next_uid"])
 
     def add_sensors(self, sensors: int) -> None:
@@ -216,9 +246,11 @@ class Layer:
 
         A plot is worth ln(Pd / (2 pi lambda)) - cost / 2 to its track.
         """
-        row, cost, fed = self.filters.associate(alive, self.life.confirmed, plots, self.gate)
+        found = np.log(look.p_detect / (2.0 * np.pi * look.clutter_density))
+        odds = Odds(found, look.log_miss)
+        row, cost, fed = self.filters.associate(alive, self.life.confirmed, plots, self.gate, odds)
         by_confirmed = (row >= 0) & self.life.confirmed[row]
-        gain = np.log(look.p_detect / (2.0 * np.pi * look.clutter_density)) - 0.5 * cost
+        gain = found - 0.5 * cost
         lives.hit(self.life, self.rules, row, fed, plots, gain, look.sensor)
         gained = (gain + np.log(look.clutter_density / look.reference_density))[fed].sum()
         return row, by_confirmed, int((row >= 0).sum() - fed.sum()), float(gained)
@@ -235,12 +267,11 @@ class Layer:
         row[unused] = rows
 
     def _miss(self, rows: IntArray, look: Look) -> float:
-        log_miss = float(np.log(max(1.0 - look.p_detect, 1e-3)))
         missed = lives.miss(
             self.life, rows, self.filters.mean, self.filters.t_s, look.t_s, look.sensor, look.site,
-            look.max_range_m, look.lately_s, look.period_s, look.margin_s, look.whole, log_miss,
+            look.max_range_m, look.lately_s, look.period_s, look.margin_s, look.whole, look.log_miss,
         )  # fmt: skip
-        return missed * log_miss
+        return missed * look.log_miss
 
     def _take(self, n: int) -> IntArray:
         while len(self._free) < n:

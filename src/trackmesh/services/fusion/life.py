@@ -6,8 +6,8 @@
 | confirmed | score above ``confirm_score`` and ``confirm_hits`` plots | lost: see below |
 
 A tentative track is dropped when its score is below ``drop_score`` or ``drop_fall`` below its best, after
-``max_misses`` misses in a row, or ``tentative_age_s`` after its last plot. A confirmed one is lost ``coast_s`` after its
-last plot, or when its score is ``end_fall`` below its best: it lives on clutter.
+``max_misses`` misses in a row, or ``tentative_age_s`` after its last plot. A confirmed one is lost ``coast_s`` after
+its last plot, or when its score is ``end_fall`` below its best: it lives on clutter.
 
 The score is a log-likelihood ratio of track against clutter: a hit adds ln(Pd / (2 pi lambda)) - (ln|S| + D)/2, a miss
 adds ln(1 - Pd) (Sittler 1964; Bar-Shalom, Willett and Tian 2011, section 7.5).

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from pydantic import ValidationError
 
@@ -20,11 +20,12 @@ from trackmesh.services.fusion.settings import EngineSettings
 class OfflineRun:
     """One pass over the records of a file.
 
-    A black box names unit and settings itself; any other recording is tracked by ``settings``.
+    A black box names unit, inputs and settings itself; any other recording is tracked by ``settings``, and the tracks
+    in it of the units that ``inputs`` names are taken as well.
 
     Attributes:
         on_refined: given the refined states of every frame, where the settings keep a lag.
-        refused: batches refused, by reason.
+        refused: batches and frames refused, by reason.
         plots: plots taken.
     """
 
@@ -34,10 +35,12 @@ class OfflineRun:
         unit_id: str = "offline",
         unit_number: int = 0,
         origin: Geodetic | None = None,
+        inputs: Sequence[str] = (),
     ) -> None:
         self._settings = settings
         self._unit = Unit(unit_id, unit_number)
         self._origin = origin
+        self._inputs = tuple(inputs)
         self._intake = Intake(0, 0)
         self._registration: RegistrationRecord | None = None
         self._state: str | None = None
@@ -74,6 +77,8 @@ class OfflineRun:
             return self._running().tick(record.t_ns)
         elif isinstance(record, PlotBatch):
             return self._plots(record)
+        elif isinstance(record, TrackFrame):
+            return self._tracks(record)
         else:
             raise TrackmeshError(f"A {type(record).__name__} is no input of the tracker.")
         return None
@@ -89,18 +94,26 @@ class OfflineRun:
         self.plots += len(batch.t_ns)
         return frame
 
+    def _tracks(self, frame: TrackFrame) -> TrackFrame | None:
+        try:
+            return self._running().tracks(frame)
+        except RefusedMessage as error:
+            self.refused[error.reason] += 1
+            return None
+
     def _begin(self, record: UnitRecord) -> None:
         try:
             self._settings = EngineSettings.model_validate(record.settings)
         except ValidationError:
             raise TrackmeshError("The black box was recorded with settings of another version of trackmesh.") from None
         self._unit = Unit(record.unit_id, record.unit_number, record.boot_id, record.first_track_number)
+        self._inputs = tuple(record.inputs)
         self._registration = record.registration
         self._state = record.state
 
     def _running(self) -> FusionEngine:
         if self.engine is None:
-            self.engine = FusionEngine(self._settings, self._unit, self._origin)
+            self.engine = FusionEngine(self._settings, self._unit, self._origin, self._inputs)
             if self._state is not None:
                 # The run began with the tracks of the one before it.
                 self.engine.restore(snapshot.from_bytes(base64.b64decode(self._state)))

@@ -72,12 +72,17 @@ class Picture:
         if len(rows):
             self._system.life.link[rows] = self.numbers(len(rows))
 
+    @property
+    def lowest_id(self) -> int:
+        """No track of this unit has a lower public number."""
+        return self._unit.number << _TRACK_BITS
+
     def numbers(self, n: int) -> IntArray:
         """Public numbers (n,) never used before."""
         if not self.next_track and self._time.epoch_ns is not None:
             self.next_track = max(1, self._time.epoch_ns // 1_000_000 - TRACK_EPOCH_MS)
         self.next_track += n
-        return (self._unit.number << _TRACK_BITS) | (self.next_track - n + np.arange(n))
+        return self.lowest_id | (self.next_track - n + np.arange(n))
 
     def last_words(self, rows: IntArray) -> TrackFrame:
         """What is to be told of rows that end now."""
@@ -122,6 +127,7 @@ class Picture:
         if self.composition is not None:
             x, P = self.composition.fuse(system_numbers(known.uid[rows]), x, P, t_s)
         state, covariance = frames.pack_states(x, P)
+        height, height_variance = frames.heights(self._system, rows, t_s)
         longest = max((s.info.period_s for s in self._sensors.values()), default=1.0)
         frame = TrackFrame.model_construct(
             schema_version=1,
@@ -135,8 +141,8 @@ class Picture:
             status=frames.status_of(self._system, rows, t_s, _COASTING_AFTER_PERIODS * longest),
             state=state,
             covariance=covariance,
-            height_m=None,
-            height_variance_m2=None,
+            height_m=height,
+            height_variance_m2=height_variance,
             model_probability=mu,
             models=self._models,
             manoeuvre_fit=frames.manoeuvre_fit(mu, self._manoeuvre_models),

@@ -93,7 +93,9 @@ class Registration:
 
     # --- what it is for ---
 
-    def shift(self, sensor_id: str, at: FloatArray, *, applied: bool = True) -> FloatArray:
+    def shift(
+        self, sensor_id: str, at: FloatArray, *, applied: bool = True, site_m: FloatArray | None = None
+    ) -> FloatArray:
         """J beta (n, 2): what has to be subtracted from measured positions; zeros until the sensor is locked.
 
         Args:
@@ -101,9 +103,11 @@ class Registration:
             at: (n, 2) measured positions, or (n, 4) with velocities: without them the time offset is left out, for
                 plots whose times were corrected by ``time_offset_s``.
             applied: False for the shift by the present estimate, locked or not.
+            site_m: (n, 2) from where each was measured, if that was not where the sensor stands now.
         """
         k = self._index[sensor_id]
-        return bias.shift(self._filter.geometries[k], at, self._sensors[k].applied if applied else self._filter.bias(k))
+        present = self._sensors[k].applied if applied else self._filter.bias(k)
+        return biases.shift_from(self._filter.geometries[k], site_m, at, present)
 
     def covariance(self, sensor_id: str, at: FloatArray) -> FloatArray:
         """Covariances (n, 2, 2) of the shift by the present estimate, locked or not. Arguments as of ``shift``."""

@@ -17,6 +17,7 @@ from trackmesh.protocol.messages import PlotBatch, SensorHealth, SensorInfo, Tra
 from trackmesh.protocol.serving import answers
 from trackmesh.services.fusion.black_box import BlackBox
 from trackmesh.services.fusion.engine import FusionEngine, Unit
+from trackmesh.services.fusion.input_feed import InputFeed
 from trackmesh.services.fusion.intake import Intake
 from trackmesh.services.fusion.keeping import Keeper
 from trackmesh.services.fusion.picture import TRACK_EPOCH_MS
@@ -31,6 +32,7 @@ _PLOTS_WAITING = 4096
 _BATCHES_HELD = 64
 _SENSORS_HELD = 256
 _ASK_EVERY_S = 0.5
+_INPUTS_EVERY_S = 0.05
 
 
 class FusionService:
@@ -48,11 +50,12 @@ class FusionService:
         self._held: dict[str, deque[PlotBatch]] = {}
         self._answered: Buffer[SensorInfo] = Buffer(_SENSORS_HELD)
         self._tick_due_s = 0.0
+        self._inputs: InputFeed | None = None
         self._keeper = Keeper(settings, runtime.log, runtime.counters.count)
         self._black_box: BlackBox | None = None
 
     def _new_engine(self) -> FusionEngine:
-        return FusionEngine(self.settings.engine, self.unit, self.settings.origin)
+        return FusionEngine(self.settings.engine, self.unit, self.settings.origin, self.settings.inputs)
 
     def start(self) -> None:
         """Compile, subscribe, serve, and be ready."""
@@ -61,12 +64,13 @@ class FusionService:
         biases = self._keeper.restore_biases(self.engine) if state is None else None
         if self.settings.black_box is not None:
             self._black_box = BlackBox(
-                self.settings.black_box, self.unit, self.settings.engine, self.settings.origin, biases, state
-            )
+                self.settings.black_box, self.unit, self.settings.engine, self.settings.origin, biases, state,
+                self.settings.inputs,
+            )  # fmt: skip
             runtime.on_exit(self._black_box.close)
         runtime.set_state("compiling")
         started = time.monotonic()
-        warm_up(self.settings.engine)
+        warm_up(self.settings.engine, inputs=bool(self.settings.inputs))
         runtime.log.info("kernels ready after %.1f s", time.monotonic() - started)
         self._frames = runtime.bus.publisher(keys.tracks(self.unit.unit_id), history=_FRAMES_KEPT)
         self._refined = runtime.bus.publisher(keys.refined(self.unit.unit_id), history=_FRAMES_KEPT)
@@ -80,6 +84,8 @@ class FusionService:
         self._tokens = runtime.closing(runtime.bus.watch_alive(keys.live("*", "*")))
         self._infos = runtime.closing(runtime.bus.subscribe(keys.sensor("*"), history=True))
         self._plots = runtime.closing(runtime.bus.subscribe(keys.plots("*"), history=True, capacity=_PLOTS_WAITING))
+        if self.settings.inputs:
+            self._inputs = InputFeed(runtime, self.settings)
         runtime.health = self.health
         runtime.closing(runtime.bus.serve(keys.service("tracks", self.unit.unit_id), self.answer))
         runtime.spawn("engine", self._run)
@@ -105,6 +111,7 @@ class FusionService:
             figures = self.engine.figures()
             counters = dict(self.engine.counters)
             sensors = [self._sensor_health(sensor_id) for sensor_id in sorted(self.intake.streams)]
+            sensors += self._inputs.health(self.engine.inputs) if self._inputs else []
         figures |= {f"engine.{name}": float(value) for name, value in counters.items()}
         figures["batches_dropped_here"] = float(self._plots.dropped)
         return Health(figures, sensors)
@@ -114,9 +121,10 @@ class FusionService:
     def _run(self) -> None:
         # Kept tracks must grow old before plots come that could be taken for theirs.
         self._tick_if_due()
+        patience_s = min(self.settings.tick_s, _INPUTS_EVERY_S) if self._inputs else self.settings.tick_s
         while not self.runtime.stopping.is_set():
             self._drain()
-            sample = self._plots.receive(timeout_s=self.settings.tick_s)
+            sample = self._plots.receive(timeout_s=patience_s)
             if sample is not None:
                 self._on_plots(sample)
             self._tick_if_due()
@@ -124,15 +132,21 @@ class FusionService:
     def _drain(self) -> None:
         while (event := self._tokens.receive(timeout_s=0)) is not None:
             kind, ident = kind_and_id(event.key)
-            if kind == "sensor":
+            if kind == "sensor" and self._wanted(ident):
                 (self._alive.add if event.alive else self._alive.discard)(ident)
                 self.runtime.log.info("sensor %s %s", ident, "is there" if event.alive else "is gone")
+            elif self._inputs and kind == KIND:
+                self._inputs.note_alive(ident, event.alive)
         while (sample := self._infos.receive(timeout_s=0)) is not None:
             self._on_info(sample)
         while (info := self._answered.receive(timeout_s=0)) is not None:
             self._take_info(info)
+        for frame in self._inputs.frames() if self._inputs else ():
+            self._take_tracks(frame)
 
     def _on_info(self, sample: Sample) -> None:
+        if not self._wanted(last_chunk(sample.key)):
+            return
         try:
             info = decode(sample.payload, SensorInfo, sample.encoding)
             if info.sensor_id != last_chunk(sample.key):
@@ -156,6 +170,8 @@ class FusionService:
 
     def _on_plots(self, sample: Sample) -> None:
         sensor_id = last_chunk(sample.key)
+        if not self._wanted(sensor_id):
+            return
         try:
             batch = decode(sample.payload, PlotBatch, sample.encoding, self.settings.max_batch_bytes)
             if batch.sensor_id != sensor_id:
@@ -191,6 +207,20 @@ class FusionService:
         if frame is not None and len(batch.t_ns) and self.settings.clock == "wall":
             self.runtime.latencies.record((time.time_ns() - int(batch.t_ns.max())) / 1e9)
 
+    def _take_tracks(self, frame: TrackFrame) -> None:
+        assert self._inputs is not None
+        self._record(frame)
+        try:
+            with self._lock:
+                ours = self.engine.tracks(frame)
+        except RefusedMessage as error:
+            self._inputs.refuse(frame.unit_id, error)
+            return
+        self._publish(ours)
+
+    def _wanted(self, sensor_id: str) -> bool:
+        return not self.settings.sensors or sensor_id in self.settings.sensors
+
     def _tick_if_due(self) -> None:
         if self.settings.clock != "wall" or time.monotonic() < self._tick_due_s:
             return
@@ -213,7 +243,7 @@ class FusionService:
             if biases is not None:
                 self._biases.put(encode(biases), encoding(biases))
 
-    def _record(self, record: SensorInfo | PlotBatch | Tick) -> None:
+    def _record(self, record: SensorInfo | PlotBatch | TrackFrame | Tick) -> None:
         if self._black_box is None:
             return
         try:

@@ -6,21 +6,37 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from trackmesh.protocol.messages import Geodetic
-from trackmesh.protocol.messages.base import NonNegative, Positive
+from trackmesh.protocol.messages.base import ID_PATTERN, ID_RE, NonNegative, Positive
 from trackmesh.services.estimation.alpha_beta_tracks import AlphaBetaTracks
 from trackmesh.services.estimation.bank import Branch, make_models
-from trackmesh.services.estimation.filters import FilterName, generic_models, manoeuvre_models, velocity_models
+from trackmesh.services.estimation.filters import (
+    FilterName,
+    generic_models,
+    manoeuvre_models,
+    velocity_models,
+    with_more_noise,
+)
+from trackmesh.services.estimation.heights import HeightTracks
 from trackmesh.services.estimation.imm_tracks import ImmTracks
 from trackmesh.services.estimation.pairs import PairRules
+from trackmesh.services.estimation.uncertain import NoiseModel
 from trackmesh.services.fusion.association import SequentialTest
 from trackmesh.services.fusion.biases import RegistrationRules
 from trackmesh.services.fusion.inputs import InputRules
 from trackmesh.services.fusion.layer import TrackFilters
 from trackmesh.services.fusion.pair_tests import PairTest, TestName, make_test
-from trackmesh.services.runtime import ServiceSettings
+from trackmesh.services.runtime import ServiceSettings, Texts
 
 
 class EngineSettings(BaseModel):
@@ -47,10 +63,18 @@ class EngineSettings(BaseModel):
     quiet_s: Positive = Field(45.0, description="tvimm: typical time between manoeuvres")
     q_quiet: Positive = Field(0.3, description="tvimm: acceleration noise of quiet flight, m/s^1.5")
     alpha_beta_acceleration_mps2: Positive = Field(5.0, description="alpha-beta: random acceleration, one sigma")
+    noise_model: NoiseModel = Field(
+        "gaussian", description="uncertain: the interference that a sensor declares counts as an error of its plots"
+    )
+    process_interference: NonNegative = Field(
+        0.0, description="uncertain: acceleration noise density of interference with the motion, m^2/s^3"
+    )
     lag: Annotated[int, Field(ge=0, le=4)] = Field(
         0, description="publish, beside the picture, states refined by this many later plots"
     )
     sigma_velocity_mps: Positive = Field(150.0, description="velocity of a new track, one sigma per axis")
+    height_q_m2ps3: Positive = Field(1.0, description="acceleration noise density of climb and descent")
+    sigma_climb_mps: Positive = Field(20.0, description="climb rate of a new track, one sigma")
     gate: Positive = Field(14.0, description="largest squared Mahalanobis distance of a plot to a track's model")
     confirm_score: Positive = Field(12.0, description="log-likelihood ratio that confirms a track")
     confirm_hits: Annotated[int, Field(ge=1)] = Field(3, description="plots a track needs to be confirmed")
@@ -76,6 +100,9 @@ class EngineSettings(BaseModel):
     )
     clutter_areas: bool = Field(True, description="estimate false plots area by area, not only over all")
     max_lateness_s: Positive = Field(10.0, description="plots older than this are dropped and counted")
+    plot_assignment: Literal["nearest", "joint"] = Field(
+        "nearest", description="joint: system tracks that are close take weighted means of plots, for formations"
+    )
     cycle_s: Positive = Field(2.0, description="association cycle")
     association: TestName = Field("seqllr", description="the test of whether local tracks are of one target")
     association_alpha: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
@@ -110,7 +137,7 @@ class EngineSettings(BaseModel):
         0.0, description="error of other units' positions that their covariances do not know, one sigma per axis"
     )
     input_reference: bool = Field(
-        False, description="other units' positions are right, but for input_error_m: learn the sensors' biases from them"
+        False, description="other units' positions are right but for input_error_m: learn the sensors' biases from them"
     )
     frame_period_s: NonNegative = Field(0.0, description="least time between frames; 0: one after every batch")
     idle_frame_s: Positive = Field(1.0, description="time between frames while no data comes")
@@ -122,11 +149,25 @@ class EngineSettings(BaseModel):
             raise ValueError("q_m2ps3 and sojourn_s must be equally long")
         if self.lag and self.filter in ("alpha-beta", "tvimm-paper"):
             raise ValueError(f"the filter {self.filter} keeps no lag: choose lag = 0 or another filter")
+        if self.plot_assignment == "joint" and self.filter == "alpha-beta":
+            raise ValueError("the filter alpha-beta takes plots one to one: choose plot_assignment = nearest")
+        if self.process_interference:
+            self._check_process_interference()
         return self
+
+    def _check_process_interference(self) -> None:
+        if self.noise_model != "uncertain":
+            raise ValueError("process_interference needs the noise model uncertain")
+        if "alpha-beta" in (self.filter, self.local_filter):
+            raise ValueError("the filter alpha-beta has no process_interference: use alpha_beta_acceleration_mps2")
 
     def system_tracks(self, rows: int) -> TrackFilters:
         """Filters for the system tracks."""
-        return self._tracks(self.filter, rows, self.ring_system, self.lag)
+        return self._tracks(self.filter, rows, self.ring_system, self.lag, self.plot_assignment == "joint")
+
+    def height_tracks(self) -> HeightTracks:
+        """The filters of the system tracks' heights."""
+        return HeightTracks(self.height_q_m2ps3 + self.process_interference, self.sigma_climb_mps)
 
     def local_tracks(self, rows: int) -> TrackFilters:
         """Filters for the local tracks of one sensor."""
@@ -138,7 +179,9 @@ class EngineSettings(BaseModel):
 
     def input_rules(self) -> InputRules:
         """What to expect of other units."""
-        return InputRules(self.coast_s, self.stitch_s, self.input_q_m2ps3, self.input_error_m, self._input_test)
+        return InputRules(
+            self.coast_s, self.stitch_s, self.input_q_m2ps3, self.input_error_m, self.input_reference, self._input_test
+        )
 
     def _input_test(self) -> PairTest:
         # What both units show may be swapped in either of them: evidence of before must fade sooner.
@@ -169,7 +212,7 @@ class EngineSettings(BaseModel):
         """How many of the models, from the first, are of the branch whose weight says that manoeuvres are modelled."""
         return len(self._branches(self.filter)[0].models) if self.filter == "tvimm" else 0
 
-    def _tracks(self, name: str, rows: int, ring: int, lags: int) -> TrackFilters:
+    def _tracks(self, name: str, rows: int, ring: int, lags: int, joint: bool = False) -> TrackFilters:
         if name == "alpha-beta":
             return AlphaBetaTracks(rows, self.sigma_velocity_mps, self.alpha_beta_acceleration_mps2)
         models = make_models(
@@ -179,14 +222,30 @@ class EngineSettings(BaseModel):
             printed=name == "tvimm-paper",
             lags=lags,
         )
-        return ImmTracks(models, rows, ring, self.sigma_velocity_mps)
+        return ImmTracks(models, rows, ring, self.sigma_velocity_mps, joint)
 
     def _branches(self, name: str) -> tuple[Branch, ...]:
+        return tuple(with_more_noise(branch, self.process_interference) for branch in self._quiet_branches(name))
+
+    def _quiet_branches(self, name: str) -> tuple[Branch, ...]:
         if name == "tvimm":
             words = (self.acceleration_max_mps2, self.manoeuvre_s, self.quiet_s, self.q_quiet)
             return (manoeuvre_models(np.deg2rad(self.turn_rate_max_degps), *words), generic_models(*words))
         prior = self.tpm_prior_count if name == "tvimm-dirichlet" else np.inf
         return (velocity_models(self.q_m2ps3, self.sojourn_s, prior),)
+
+
+def _ids(names: list[str]) -> list[str]:
+    for name in names:
+        if not ID_RE.fullmatch(name):
+            raise ValueError(f"{name!r} is no name: it must match {ID_PATTERN}")
+    if len(set(names)) < len(names):
+        raise ValueError("a name is given twice")
+    return names
+
+
+Ids = Annotated[Texts, AfterValidator(_ids)]
+"""Names, in the environment and in flags separated by commas."""
 
 
 class FusionSettings(ServiceSettings):
@@ -196,6 +255,8 @@ class FusionSettings(ServiceSettings):
         0, description="number of this unit, unique in the realm: the high bits of its track ids"
     )
     origin: Geodetic | None = Field(None, description="origin of the system plane; default: the first geodetic site")
+    sensors: Ids = Field([], description="take the plots of these sensors only; default: all of the realm")
+    inputs: Ids = Field([], description="other units, or trackers, whose tracks are taken as well")
     engine: EngineSettings = EngineSettings()
     clock: Literal["wall", "data"] = Field(
         "wall", description="wall: plots must be of now; data: time is that of the plots (replayed recordings)"
@@ -213,3 +274,10 @@ class FusionSettings(ServiceSettings):
     registration_file: Path | None = Field(
         None, description="file that keeps the sensors' biases over restarts; read at the start, written every minute"
     )
+
+    @field_validator("inputs")
+    @classmethod
+    def _not_itself(cls, inputs: list[str], info: ValidationInfo) -> list[str]:
+        if info.data.get("unit_id") in inputs:
+            raise ValueError("a unit cannot take its own tracks")
+        return inputs

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from trackmesh.protocol.codec import from_object
-from trackmesh.protocol.errors import RefusedMessage, TrackmeshError
+from trackmesh.protocol.errors import TrackmeshError
 from trackmesh.protocol.files import RegistrationRecord
 from trackmesh.protocol.messages import Geodetic, SensorInfo
 
@@ -91,7 +90,9 @@ def from_bytes(data: bytes) -> Snapshot:
             streams={str(name): list(last) for name, last in told["streams"].items()},
             arrays=arrays,
         )
-    except (ValueError, KeyError, TypeError, AttributeError, OSError, EOFError, zipfile.BadZipFile, RefusedMessage):
+    except TrackmeshError:
+        raise
+    except Exception:
         raise TrackmeshError("This is no state of a fusion unit.") from None
 
 
