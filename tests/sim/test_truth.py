@@ -110,7 +110,9 @@ def test_the_share_of_turning_is_what_was_asked() -> None:
 
 
 def test_births_and_deaths(two_radars: Scenario) -> None:
-    targets = two_radars.seen_targets().model_copy(update={"appear_s": 30.0, "lifetime_s": (40.0, 60.0), "quiet_count": 0})
+    targets = two_radars.seen_targets().model_copy(
+        update={"appear_s": 30.0, "lifetime_s": (40.0, 60.0), "quiet_count": 0}
+    )
     truth = make_truth(two_radars.model_copy(update={"targets": targets}), 1)
     assert (truth.born_s <= 30.0).all()
     assert (truth.born_s > 0.0).all()

@@ -12,11 +12,13 @@ from tests.network.processes import wait_until
 from tests.services.fusion.makers import EAST, FAR_APART, NORTH, live, ns, scans
 from tests.services.fusion.running import KEYS, Running
 from tests.services.fusion.units import IDENT, Sender, frame
+from typer.testing import CliRunner
 
 from trackmesh.protocol.codec import encode, encoding
-from trackmesh.protocol.files import read_records
+from trackmesh.protocol.files import read_records, to_line
 from trackmesh.protocol.memory_bus import MemoryHub
 from trackmesh.protocol.messages import SensorHealth, TrackFrame
+from trackmesh.services.cli.main import app
 from trackmesh.services.fusion.offline import OfflineRun
 from trackmesh.services.fusion.settings import EngineSettings, FusionSettings
 from trackmesh.services.runtime import SettingsError
@@ -146,6 +148,18 @@ def test_a_recording_may_hold_the_tracks_of_named_units() -> None:
     unnamed = OfflineRun(EngineSettings(), "main", 1)
     assert not list(unnamed.frames(records))
     assert unnamed.refused == {"unknown_input": 12}
+
+
+def test_the_command_track_takes_them_when_told_to(tmp_path: Path) -> None:
+    file, out = tmp_path / "in.jsonl", tmp_path / "out.jsonl"
+    sender = Sender(FAR_APART)
+    file.write_text("".join(to_line(sender.at(t)) + "\n" for t in np.arange(0.5, 12.0).tolist()), encoding="utf-8")
+    result = CliRunner().invoke(app, ["track", str(file), "--out", str(out), "--inputs", "other"])
+    assert result.exit_code == 0, result.output
+    *_, last = read_records(out, TrackFrame)
+    assert isinstance(last, TrackFrame) and len(live(last)) == 4
+    result = CliRunner().invoke(app, ["track", str(file), "--out", str(out)])
+    assert result.exit_code == 0 and "12 refused: unknown_input" in result.stderr
 
 
 @pytest.mark.parametrize(

@@ -104,6 +104,8 @@ class Setting(NamedTuple):
 def _run(setting: Setting, seconds: float, children: Children, stop: threading.Event) -> DemoState:
     state = DemoState(seconds)
     endpoint = f"tcp/127.0.0.1:{setting.port}"
+    if _listens(setting.port):
+        raise TrackmeshError(f"The router cannot listen at {endpoint}; is another one running there?")
     children.start("router", ["router", "--listen", endpoint])
     children.start("fusion", ["fusion", "--connect", endpoint, "--black-box", str(setting.folder / "black-box.jsonl")])
     children.start("emi", ["emi", "--connect", endpoint])
@@ -186,11 +188,15 @@ def _wait_router(children: Children, port: int, stop: threading.Event) -> None:
     deadline = time.monotonic() + _ROUTER_S
     while not stop.wait(0.05):
         children.check()
-        with socket.socket() as probe:
-            if probe.connect_ex(("127.0.0.1", port)) == 0:
-                return
+        if _listens(port):
+            return
         if time.monotonic() > deadline:
             raise TrackmeshError(f"The router did not listen within {_ROUTER_S:g} s.")
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 def _wait_ready(children: Children, watched: Watched, missing: set[str], stop: threading.Event) -> None:

@@ -20,6 +20,7 @@ Study = Callable[[Path | None, int, Callable[[float], None] | None], StudyResult
 def _studies() -> dict[str, Study]:
     from trackmesh.sim.studies import alpha_beta, tvimm
     from trackmesh.sim.studies.association import study as association
+    from trackmesh.sim.studies.emi import study as emi
     from trackmesh.sim.studies.manoeuvre import study as manoeuvre
     from trackmesh.sim.studies.rfid import study as rfid
 
@@ -29,12 +30,13 @@ def _studies() -> dict[str, Study]:
         "association": association.run,
         "alpha-beta": alpha_beta.run,
         "rfid": rfid.run,
+        "emi": emi.run,
     }
 
 
 @told
 def study(
-    name: Annotated[str, typer.Argument(help="tvimm, manoeuvre, association, alpha-beta or rfid")],
+    name: Annotated[str, typer.Argument(help="tvimm, manoeuvre, association, alpha-beta, rfid or emi")],
     json_path: Annotated[Path | None, typer.Option("--json", help="Write the rows here.")] = None,
     plots: Annotated[Path | None, typer.Option("--plots", help="Write the figures to this folder.")] = None,
     runs: Annotated[int, typer.Option("--runs", min=0, help="Monte-Carlo runs; 0: as many as the study needs.")] = 0,

@@ -99,7 +99,13 @@ def invert(
 
 
 def invert_over(ready: Survey, field_t: FloatArray, sigma_t: FloatArray | float | None) -> Iterator[ScanResult]:
-    """As ``invert``, over a geometry that is ready."""
+    """As ``invert``, over a geometry that is ready.
+
+    Raises:
+        ValueError: the noise is given where the geometry was made ready for scans without, or the other way round.
+    """
+    if (sigma_t is not None) != ready.setting.sigma_known:
+        raise ValueError("The survey was made ready for scans of the other kind: with noise, or without.")
     chunk = chunk_length(field_t.shape[2])
     for first in range(0, len(field_t), chunk):
         indices = range(first, min(first + chunk, len(field_t)))

@@ -57,27 +57,23 @@ class Scan(NamedTuple):
         y: (C, W, K) field in T, 0 where masked.
         w: (C, W, K) one over its standard deviation, 0 where masked.
         n_masked: samples with something missing.
+        n_used: samples of which something is there.
+        n_numbers: numbers that are there.
     """
 
     scan_index: int
     y: FloatArray
     w: FloatArray
     n_masked: int
-
-    @property
-    def n_numbers(self) -> int:
-        """Numbers that are there."""
-        return int((self.w > 0.0).sum())
-
-    @property
-    def n_used(self) -> int:
-        """Samples of which something is there."""
-        return int((self.w > 0.0).any((0, 2)).sum())
+    n_used: int
+    n_numbers: int
 
 
-def readings_there(sensor: Sensor, field_t: FloatArray) -> BoolArray:
-    """Which numbers (W, K) are usable: a receiver of a sample with all its components, in all channels."""
+def readings_there(sensor: Sensor, field_t: FloatArray) -> BoolArray | None:
+    """Which numbers (W, K) are usable: a receiver of a sample with all its components, in all channels; None: all."""
     finite = np.isfinite(field_t).all(0)
+    if finite.all():
+        return None
     whole = np.logical_and.reduceat(finite, sensor.first[:-1], axis=1)
     return np.asarray(np.repeat(whole, np.diff(sensor.first), axis=1))
 
@@ -105,18 +101,27 @@ def prepared(
         field_t, relative = averaged_field(field_t, 1.0 if sigma_t is None else sigma_t, blocks)
         sigma_t = None if sigma_t is None else 1.0
     there = readings_there(sensor, field_t)
-    y = np.where(there, field_t, 0.0)
-    if centred and there.any():
-        # A large constant must not cost digits.
-        level = float(np.abs(y).max())
+    y = field_t if there is None else np.where(there, field_t, 0.0)
+    if centred:
+        y = _centred(y, there)
+    w = np.empty(field_t.shape)
+    w[:] = 1.0 / (relative * (assumed_sigma(sensor, y) if sigma_t is None else sigma_t))
+    if there is None:
+        return Scan(index, np.array(y, np.float64, order="C"), w, 0, y.shape[1], y.size)
+    w[:, ~there] = 0.0
+    missing, used = int((~there.all(1)).sum()), int(there.any(1).sum())
+    return Scan(index, np.ascontiguousarray(y), w, missing, used, int(there.sum()) * len(y))
+
+
+def _centred(y: FloatArray, there: BoolArray | None) -> FloatArray:
+    """The field (C, W, K) with its means taken off: a large constant must not cost digits."""
+    level = max(float(y.max(initial=0.0)), -float(y.min(initial=0.0)))
+    if there is None:
+        y = y - y.mean(1, keepdims=True)
+    else:
         y = np.where(there, y - y.sum(1, keepdims=True) / np.maximum(there.sum(0), 1), 0.0)
-        if float(np.abs(y).max()) <= ROUNDING * level:
-            y = np.zeros_like(y)
-    if sigma_t is None:
-        sigma_t = assumed_sigma(sensor, y)
-    w = np.where(there, 1.0 / np.broadcast_to(sigma_t * relative, field_t.shape), 0.0)
-    missing = int((~there.all(1)).sum())
-    return Scan(index, np.ascontiguousarray(y), np.ascontiguousarray(w), missing)
+    left = max(float(y.max(initial=0.0)), -float(y.min(initial=0.0)))
+    return y if left > ROUNDING * level else np.zeros_like(y)
 
 
 def assumed_sigma(sensor: Sensor, y: FloatArray) -> FloatArray:

@@ -94,9 +94,11 @@ def start_points(sensor: Sensor, power: FloatArray, ground: Ground) -> FloatArra
 def _sides_of_line(flat_m: FloatArray) -> list[FloatArray]:
     """Unit vectors (2,) to both sides of the line on which all points (n, 2) lie; none if they do not."""
     centred = flat_m - flat_m.mean(0)
-    extent, axes = np.linalg.eigh(centred.T @ centred)
-    if extent[0] > LINE**2 * extent[1]:
+    spread = centred.T @ centred
+    # The product of the eigenvalues against the square of their sum.
+    if spread[0, 0] * spread[1, 1] - spread[0, 1] ** 2 > (LINE * (spread[0, 0] + spread[1, 1])) ** 2:
         return []
+    _, axes = np.linalg.eigh(spread)
     return [axes[:, 0], -axes[:, 0]]
 
 

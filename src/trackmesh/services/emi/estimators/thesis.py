@@ -31,13 +31,19 @@ def initial(task: Task) -> Fit:
 
 def kf_ekf_thesis(task: Task) -> Fit:
     """Table 4-1: one pass of the separate filters from the initial state."""
-    sensor, y, w = task.sensor, task.y, task.w
+    return appraise(task, *filtered_state(task))
+
+
+def filtered_state(task: Task, samples: int | None = None) -> tuple[FloatArray, FloatArray]:
+    """Position (3,) and tensors (C, 6) after so many samples; None: after all."""
+    sensor, y, w = task.sensor, task.y, task.w.copy()
+    if samples is not None:
+        w[:, samples:] = 0.0
     r, tensor = initial_state(task)
     # The thesis leaves out all constants: h = G(d) M G(d) z, in m^-3 with M in m^3.
     unit = SCALE * sensor.moment_am2 / (4.0 * pi)
     bare = sensor._replace(moment_am2=4.0 * pi / SCALE)
-    r, tensor = separate_filters(bare, y / unit, (w > 0.0).astype(np.float64), r, tensor, P0, Q)
-    return appraise(task, r, tensor)
+    return separate_filters(bare, y / unit, (w > 0.0).astype(np.float64), r, tensor, P0, Q)
 
 
 def initial_state(task: Task) -> tuple[FloatArray, FloatArray]:

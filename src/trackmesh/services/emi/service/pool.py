@@ -91,6 +91,7 @@ class WorkerPool:
         self._tickets: deque[_Ticket] = deque()
         self._closing = threading.Event()
         self._ready = threading.Semaphore(0)
+        self._warm = threading.Event()
         self._children: dict[int, Child] = {}
         self._threads = [
             threading.Thread(target=self._employ, args=(i,), name=f"emi-worker-{i}", daemon=True)
@@ -150,11 +151,15 @@ class WorkerPool:
 
     def _employ(self, number: int) -> None:
         """Keep one worker at work, and start another when it dies."""
+        # With a cold cache the first one compiles for all.
+        while number and not self._warm.wait(LOOK_S) and not self._closing.is_set():
+            pass
         first = True
         while not self._closing.is_set():
             child = self._children[number] = Child()
             try:
                 child.wait_ready()
+                self._warm.set()
                 if first:
                     self._ready.release()
                     first = False
