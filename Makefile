@@ -25,7 +25,7 @@ check: $(VENV)/ready
 
 studies: $(VENV)/ready
 	mkdir -p out/studies
-	for name in tvimm manoeuvre association alpha-beta rfid; do \
+	for name in tvimm manoeuvre association alpha-beta rfid emi; do \
 		$(BIN)/trackmesh study $$name --json out/studies/$$name.json --plots out/studies || exit 1; done
 
 bench: $(VENV)/ready

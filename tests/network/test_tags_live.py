@@ -18,6 +18,7 @@ from trackmesh.protocol.files import read_records, to_line
 from trackmesh.protocol.messages import LOCATED, LOST, ServiceStatus, TagFrame
 from trackmesh.protocol.zenoh_bus import ZenohBus
 from trackmesh.services.cli.main import app
+from trackmesh.sim.recording import START_NS
 from trackmesh.sim.scenario import load_scenario
 from trackmesh.sim.tags import TagWorld
 
@@ -31,8 +32,8 @@ class Hall:
     def __init__(self, processes: Processes, router: RouterProcess, realm: str, folder: Path) -> None:
         self._processes = processes
         self._realm = realm
-        self._config = folder / "tags.toml"
-        self._config.write_text(CONFIG)
+        self.config = folder / "tags.toml"
+        self.config.write_text(CONFIG)
         self.endpoint = router.endpoint
         self.start_ns = time.time_ns()
 
@@ -47,7 +48,7 @@ class Hall:
     def service(self, client: Client, *more: str) -> tuple[Process, ServiceStatus]:
         """Start the service; it, and its status once it is ready."""
         with client.watch_statuses("tags") as watch:
-            process = self.trackmesh("tags", "--config", str(self._config), *more)
+            process = self.trackmesh("tags", "--config", str(self.config), *more)
             ready = next_where(watch, lambda s: s.state == "ready", "the service is ready", READY_S)
         return process, ready
 
@@ -135,3 +136,22 @@ def test_a_file_that_is_missing_is_one_sentence(hall: Hall) -> None:
     wait_until(lambda: not process.running, "the service gives up", 30.0)
     assert process.stop() == 1
     assert "Cannot read missing.toml" in process.output and "Traceback" not in process.output
+
+
+@pytest.mark.timeout(READY_S + 120)
+def test_a_recording_of_ranges_is_played(hall: Hall, client: Client, tmp_path: Path) -> None:
+    ranges, tags = tmp_path / "ranges.jsonl", tmp_path / "tags.jsonl"
+    made = CliRunner().invoke(app, ["sim", "ranges", str(ranges), "--seconds", "10"])
+    assert made.exit_code == 0, made.output
+    hall.service(client, "--clock", "data")
+    with client.watch_tags(history=False, capacity=100_000) as frames:
+        player = hall.trackmesh("play", str(ranges), "--speed", "0", "--keep-time")
+        end_ns = START_NS + 9_500_000_000
+        last = next_where(frames, lambda f: f.tag_id == ["tag-1"] and f.t_ns > end_ns, "the end", 40.0)
+        wait_until(lambda: not player.running, "the player has ended", 20.0)
+    assert player.stop() == 0 and "101 batches published" in player.output
+    located = CliRunner().invoke(app, ["locate", str(ranges), "--out", str(tags), "--config", str(hall.config)])
+    assert located.exit_code == 0, located.output
+    here = {frame.t_ns: frame for frame in read_records(tags, TagFrame) if isinstance(frame, TagFrame)}
+    # The first ranges may have come before the readers were known.
+    np.testing.assert_allclose(last.state[:, :2], here[last.t_ns].state[:, :2], atol=0.1)

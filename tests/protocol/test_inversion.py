@@ -225,6 +225,21 @@ def test_a_finished_inversion_leaves_nothing_behind(bus: MemoryBus, client: Clie
     wait_until(lambda: not [t for t in threading.enumerate() if t.name.startswith("invert-")], "the threads end")
 
 
+def test_one_may_wait_for_a_while_only(bus: MemoryBus, client: Client) -> None:
+    release = threading.Event()
+
+    def slowly(batch: EmiScanBatch) -> Iterator[bytes]:
+        release.wait(10.0)
+        yield from well(batch)
+
+    serve(bus, "a", slowly)
+    inversion = client.invert(scans(2))
+    assert inversion.receive(0.05) is None
+    release.set()
+    assert {r.index for r in inversion} == {0, 1}
+    assert inversion.receive(0.05) is None
+
+
 def test_nobody_there_is_told(client: Client) -> None:
     with pytest.raises(Unavailable, match="No emi service is alive"):
         list(client.invert(scans(2), timeout_s=0.2))

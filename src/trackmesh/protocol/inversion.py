@@ -119,7 +119,7 @@ class _Work:
 
 
 class Inversion(Iterator[EmiResult]):
-    """The results of a batch, each as it is done, in any order; iterate over it.
+    """The results of a batch, each as it is done, in any order; iterate over it, or ``receive`` with a time limit.
 
     It ends early by ``cancel``, at the end of a ``with`` block, and when nobody holds it any more; the services are
     then told that nobody waits.
@@ -156,12 +156,19 @@ class Inversion(Iterator[EmiResult]):
         """Have no further results; twice is once."""
         self._end()
 
-    def __next__(self) -> EmiResult:
+    def receive(self, timeout_s: float | None = None) -> EmiResult | None:
+        """The next result; None when there are no more, or the time is over. Raises as iterating does."""
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while self.done < self.total and self._end.alive:
             if not self._threads:
                 self.cancel()
                 raise self._why()
-            event = self._work.events.get()
+            try:
+                event = self._work.events.get(
+                    timeout=None if deadline is None else max(0.0, deadline - time.monotonic())
+                )
+            except queue.Empty:
+                return None
             if isinstance(event, _Over):
                 self._take_over(event)
                 continue
@@ -170,7 +177,12 @@ class Inversion(Iterator[EmiResult]):
             self.by_unit[unit] += 1
             return result
         self.cancel()
-        raise StopIteration
+        return None
+
+    def __next__(self) -> EmiResult:
+        if (result := self.receive()) is None:
+            raise StopIteration
+        return result
 
     def _take_over(self, event: _Over) -> None:
         self._threads -= 1

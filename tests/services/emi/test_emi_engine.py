@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+import ast
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.stats import chi2
 from tests.services.emi.makers import (
     COARSE,
@@ -19,6 +23,8 @@ from tests.services.emi.makers import (
 
 from trackmesh.protocol.messages import EmiGeometry, EmiTransmitter
 from trackmesh.services.emi.engine import CHUNK_SAMPLES, invert
+from trackmesh.services.emi.fields import from_elements
+from trackmesh.services.emi.polarizability import rotation
 from trackmesh.services.emi.scans import Options
 from trackmesh.services.emi.sensor import sensor_arrays
 from trackmesh.services.emi.service.convert import to_coils
@@ -183,3 +189,33 @@ def test_angles_and_axis_come_with_a_target() -> None:
     (sphere,) = solve(COARSE, noisy(clean_field_nt(COARSE, ball()), 20.0, 1)[0], sigma)[0].targets
     assert sphere.axis is None
     assert sphere.attitude.undefined["theta"] == "isotropic"
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.floats(-3.0, 3.0), st.floats(-50.0, 50.0), st.floats(-50.0, 50.0))
+def test_a_scan_that_is_turned_and_moved_has_its_target_turned_and_moved(yaw: float, east: float, north: float) -> None:
+    field, sigma = noisy(clean_field_nt(COARSE, rod()), 20.0, 1)
+    turn, shift = rotation(yaw, 0.0, 0.0).T, np.array([east, north, 3.0])
+    moved = COARSE.model_copy(update={"positions_m": COARSE.positions_m @ turn.T + shift})
+    (usual,), (other,) = solve(COARSE, field, sigma)[0].targets, solve(moved, field @ turn.T, sigma)[0].targets
+    np.testing.assert_allclose(other.position_m, turn @ usual.position_m + shift, atol=2e-4)
+    np.testing.assert_allclose(
+        from_elements(other.tensor_m3[0]), turn @ from_elements(usual.tensor_m3[0]) @ turn.T, atol=2e-4
+    )
+    np.testing.assert_allclose(other.principal_m3, usual.principal_m3, rtol=5e-3)
+    assert other.axis is not None and usual.axis is not None
+    assert abs(other.axis @ turn @ usual.axis) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_numerics_and_engine_know_no_clock_no_network_no_messages() -> None:
+    banned = {"time", "datetime", "logging", "pydantic", "socket", "threading", "zenoh"}
+    room = Path(__file__).resolve().parents[3] / "src/trackmesh/services/emi"
+    for path in (*room.glob("*.py"), *room.glob("estimators/*.py"), *room.glob("diagnosis/*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module]
+            assert not {name.split(".")[0] for name in names} & banned, path
+            assert not any(name.startswith(("trackmesh.protocol", "trackmesh.services.runtime")) for name in names), (
+                path
+            )

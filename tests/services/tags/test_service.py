@@ -111,8 +111,10 @@ def test_frames_are_published_and_the_status_tells_of_them(running: Running) -> 
     assert last is not None and last.tag_id == ["tag-1"] and last.status.tolist() == [LOCATED]
     assert math.dist(last.state[0, :2], PLACE) < 0.5
     assert last.boot_id == running.runtime.boot_id
+    # A frame is out before its ranges are counted.
+    wait_until(lambda: running.status().counters["ranges"] == 24, "all ranges are counted")
     status = running.status()
-    assert (status.figures["located"], status.figures["readers"], status.counters["ranges"]) == (1, 4, 24)
+    assert (status.figures["located"], status.figures["readers"]) == (1, 4)
     assert status.latency_ms["p50"] < 10_000
     assert running.frames.refused == {}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,6 +15,7 @@ from pydantic import ValidationError
 from trackmesh.protocol.codec import refusal
 from trackmesh.protocol.errors import TrackmeshError
 from trackmesh.protocol.files import RecordWriter, read_records, to_line
+from trackmesh.protocol.inversion import Inversion
 from trackmesh.protocol.messages import EmiOptions, EmiReceiver, EmiResult, EmiScanBatch, EmiTransmitter
 from trackmesh.services.cli.options import AsJson, Config, Connect, Realm, Unit, client, out, say, told
 from trackmesh.services.cli.progress import progress_bar
@@ -21,6 +23,7 @@ from trackmesh.services.cli.tables import result_table
 from trackmesh.services.process import on_signal
 
 Invert = Callable[[EmiScanBatch], Iterable[EmiResult]]
+LOOK_S = 0.2
 WORTH_PROCESSES = 1_000_000
 """Numbers above which worker processes are started for --local."""
 
@@ -79,11 +82,20 @@ def _all_results(batches: list[EmiScanBatch], work: Invert, stop: threading.Even
 
 def _results(batch: EmiScanBatch, work: Invert, stop: threading.Event) -> Iterator[EmiResult]:
     with progress_bar(batch.batch_id, len(batch.field)) as advance:
-        for done, result in enumerate(work(batch), 1):
-            if stop.is_set():
-                return
+        for done, result in enumerate(_until(stop, work(batch)), 1):
             yield result
             advance(done)
+
+
+def _until(stop: threading.Event, found: Iterable[EmiResult]) -> Iterator[EmiResult]:
+    """What is found until told to stop; who is asked over the network may also not answer at all."""
+    if not isinstance(found, Inversion):
+        yield from takewhile(lambda _: not stop.is_set(), found)
+        return
+    with found:
+        while not stop.is_set() and found.done < found.total:
+            if (result := found.receive(LOOK_S)) is not None:
+                yield result
 
 
 @contextmanager
@@ -192,11 +204,12 @@ def convert_emi_csv(
         for batch in found.batches:
             file.write(batch)
     samples = sum(batch.field.shape[2] for batch in found.batches)
-    say(f"{len(found.batches)} scans, {samples} samples in {out_path}")
+    words = [f"{len(found.batches)} scans, {samples} samples in {out_path}"]
     if found.without_place:
-        say(f"{found.without_place} rows without a place were left out")
+        words.append(f"{found.without_place} rows without a place left out")
     if found.origin_m.any():
-        say(f"places are from x = {found.origin_m[0]:.0f} m, y = {found.origin_m[1]:.0f} m")
+        words.append(f"places are from x = {found.origin_m[0]:.0f} m, y = {found.origin_m[1]:.0f} m")
+    say("; ".join(words))
 
 
 def _receiver(text: str) -> EmiReceiver:

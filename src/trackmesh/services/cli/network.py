@@ -178,7 +178,7 @@ def status(as_json: AsJson = False, config: Config = None, connect: Connect = No
 
 @told
 def play(
-    plots: Annotated[Path, typer.Argument(metavar="PLOTS.jsonl", help="A recording.")],
+    plots: Annotated[Path, typer.Argument(metavar="PLOTS.jsonl", help="A recording, of plots or of ranges.")],
     speed: Annotated[
         float,
         typer.Option("--speed", min=0.0, metavar="X", help="1: as fast as it happened; 0: as fast as possible."),
@@ -192,7 +192,7 @@ def play(
 ) -> None:
     """Publish a recording as its sensors did.
 
-    At another speed than 1 the recorded times are kept, and fusion needs --clock data.
+    At another speed than 1 the recorded times are kept, and the services need --clock data.
     """
     # All of it first: what is wrong with the file is told before anything is published.
     records, stop = list(read_records(plots)), threading.Event()

@@ -9,7 +9,15 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from rich.table import Table
 
-from trackmesh.protocol.messages import EmiResult, SensorBias, SensorInfo, ServiceStatus, TagFrame, TrackFrame
+from trackmesh.protocol.messages import (
+    EmiResult,
+    EmiTarget,
+    SensorBias,
+    SensorInfo,
+    ServiceStatus,
+    TagFrame,
+    TrackFrame,
+)
 
 STATUS_NAMES = ("tentative", "confirmed", "coasting", "ended")
 TAG_STATUS_NAMES = ("unsure", "located", "lost", "gone")
@@ -185,7 +193,7 @@ def status_table(statuses: Iterable[ServiceStatus]) -> Table:
 
 
 def result_table(results: list[EmiResult]) -> Table:
-    """One row a scan."""
+    """One row a scan, and one for each target after its first."""
     table = Table(title=f"{len(results)} scans", title_justify="left")
     for name in (
         "scan",
@@ -195,26 +203,26 @@ def result_table(results: list[EmiResult]) -> Table:
         "depth m",
         "1 sigma cm",
         "principal m^3",
+        "shape",
         "chi2/dof",
         "reasons",
     ):
         table.add_column(name)
     for r in results:
-        place = ["-", "-", "-", "-", "-"]
-        if r.targets:
-            t = r.targets[0]
-            sigma = float(t.covariance[[0, 1, 2], [0, 1, 2]].sum()) ** 0.5
-            principal = ", ".join(f"{p:.4g}" for p in t.principal_m3)
-            place = [
-                f"{t.position_m[0]:.3f}",
-                f"{t.position_m[1]:.3f}",
-                f"{t.depth_m:.3f}",
-                f"{sigma * 100:.2f}",
-                principal,
-            ]
         fit = f"{r.chi2 / r.dof:.3f}" if r.chi2 is not None and r.dof else "-"
-        table.add_row(f"{r.batch_id}/{r.index}", r.status, *place, fit, ", ".join(r.reasons) or "-")
+        first = [_target_cells(target) for target in r.targets[:1]] or [["-"] * 6]
+        table.add_row(f"{r.batch_id}/{r.index}", r.status, *first[0], fit, ", ".join(r.reasons) or "-")
+        for target in r.targets[1:]:
+            table.add_row("", "", *_target_cells(target))
     return table
+
+
+def _target_cells(target: EmiTarget) -> list[str]:
+    sigma = float(target.covariance[[0, 1, 2], [0, 1, 2]].sum()) ** 0.5
+    east, north, _ = target.position_m
+    principal = ", ".join(f"{p:.4g}" for p in target.principal_m3)
+    shape = target.shape or "-"
+    return [f"{east:.3f}", f"{north:.3f}", f"{target.depth_m:.3f}", f"{sigma * 100:.2f}", principal, shape]
 
 
 def _pairs(counts: dict[str, int]) -> str:
