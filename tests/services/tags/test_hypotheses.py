@@ -209,3 +209,12 @@ def test_a_mirrored_filter_is_the_mirrored_one(more: dict[str, Any]) -> None:
     np.testing.assert_allclose(one.f.P, flip @ P @ flip.T, atol=1e-12)
     mirror._reflect(one.f, line)
     np.testing.assert_allclose(one.f.x, x, atol=1e-12)
+
+
+def test_where_another_reader_hears_no_side_is_in_doubt() -> None:
+    tags = Table(SQUARE, speed_mps=1.5, acceleration_mps2=0.7)
+    for k in range(140):
+        # It dwells on the line of two readers, and goes on inside.
+        north = np.interp(0.1 * k, [0.0, 2.0, 4.0, 9.0, 14.0], [8.0, 8.0, 0.0, 0.0, 10.0])
+        tags.hear(0.1 * k, (20.0, north), 0, 1, k % 4)
+        assert tags.state == LOCATED

@@ -48,6 +48,7 @@ IntArray = npt.NDArray[np.int64]
 _TENTATIVE_AGE_PERIODS = 2.2
 _SEEN_LATELY_PERIODS = 5.0
 _JUDGED_SECTORS_LATE = 1.5
+_MISSES_TO_END = 5.2  # of a sensor that never misses one miss weighs much, and two can be an accident
 _ROWS = 256
 
 
@@ -391,7 +392,9 @@ class FusionEngine:
 
     def _rules(self, period_s: float, coast_s: float) -> Rules:
         s = self.settings
+        surest = max((sensor.info.p_detect for sensor in self.sensors.values()), default=0.0)
+        end_fall = max(s.end_fall, _MISSES_TO_END * -float(np.log(max(1.0 - surest, 1e-3))))
         return Rules(
             s.confirm_score, s.confirm_hits, s.score_cap, s.drop_score, s.drop_fall, s.max_misses,
-            _TENTATIVE_AGE_PERIODS * period_s, coast_s, s.end_fall,
+            _TENTATIVE_AGE_PERIODS * period_s, coast_s, end_fall,
         )  # fmt: skip
