@@ -23,7 +23,7 @@ FloatArray = npt.NDArray[np.float64]
 _FLAT = 0.02
 _NEAR = 1.5**2
 _CLEAR = 3.0**2
-_BLURRED = 1e12
+_BLURRED = 6.0**2
 
 KNOWN, MIRRORED, BLURRED = range(3)
 """What ``watch_side`` finds."""
