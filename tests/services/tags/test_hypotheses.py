@@ -212,9 +212,10 @@ def test_a_mirrored_filter_is_the_mirrored_one(more: dict[str, Any]) -> None:
 
 
 def test_where_another_reader_hears_no_side_is_in_doubt() -> None:
-    tags = Table(SQUARE, speed_mps=1.5, acceleration_mps2=0.7)
+    readers = np.array([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0], [20.0, -10.0, 0.0]])
+    tags = Table(readers, speed_mps=1.5, acceleration_mps2=0.7)
     for k in range(140):
-        # It dwells on the line of two readers, and goes on inside.
+        # It dwells on the line of two readers, and leaves it again.
         north = np.interp(0.1 * k, [0.0, 2.0, 4.0, 9.0, 14.0], [8.0, 8.0, 0.0, 0.0, 10.0])
-        tags.hear(0.1 * k, (20.0, north), 0, 1, k % 4)
+        tags.hear(0.1 * k, (25.0, north), 0, 1, 2)
         assert tags.state == LOCATED
