@@ -79,15 +79,13 @@ def test_portions_are_all_scans_once(n: int, services: int) -> None:
 
 
 def test_all_services_have_a_share(bus: MemoryBus, client: Client) -> None:
-    met = threading.Barrier(2, timeout=10.0)
-    begun: set[str] = set()
+    begun = {unit: threading.Event() for unit in "ab"}
 
     def together(unit: str) -> Answering:
         def answering(batch: EmiScanBatch) -> Iterator[bytes]:
-            # Neither goes on before both have been asked.
-            if unit not in begun:
-                begun.add(unit)
-                met.wait()
+            # No portion is answered before both have been asked for one.
+            begun[unit].set()
+            assert all(event.wait(30.0) for event in begun.values())
             yield from well(batch)
 
         return answering

@@ -212,7 +212,7 @@ def test_a_mirrored_filter_is_the_mirrored_one(more: dict[str, Any]) -> None:
 
 
 def test_where_another_reader_hears_no_side_is_in_doubt() -> None:
-    readers = np.array([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0], [20.0, -10.0, 0.0]])
+    readers = np.array([[0.0, 0.0, 0.0], [20.0, -10.0, 0.0], [40.0, 0.0, 0.0]])
     tags = Table(readers, speed_mps=1.5, acceleration_mps2=0.7)
     for k in range(140):
         # It dwells on the line of two readers, and leaves it again.
