@@ -40,6 +40,8 @@ LARGE = 256
 PEER = "KF-EKF of the thesis in numpy, one scan at a time"
 READY_S = 240.0
 
+Seconds = np.ndarray[tuple[int], np.dtype[np.float64]]
+
 
 def rows() -> Iterator[dict[str, object]]:
     """Rows for ``benchmarks/latest.json``."""
@@ -57,17 +59,16 @@ def rows() -> Iterator[dict[str, object]]:
 
 
 def _many(batch: EmiScanBatch) -> Iterator[dict[str, object]]:
-    """One core, all cores, network, memory: wall-clock times of one large batch."""
+    """One core, all cores, each over the network too, memory: wall-clock times of one large batch.
+
+    With as many workers as cores the client and the router take their share from the workers.
+    """
     name, n_cores = f"41x41 loop B={LARGE}", cores()
-    with _pool(1) as local:
-        one = wall(lambda: local(batch))
-    with _pool(n_cores) as local, _service() as client:
-        # In turn, so that whatever else the machine does meets both.
-        both = [(wall(lambda: local(batch), 1), wall(lambda: client.invert(batch), 1)) for _ in range(REPEATS)]
-        here, there = (np.concatenate(times) for times in zip(*both, strict=True))
-        memory = _memory_mib(os.getpid())
+    one, one_there, _ = _here_and_there(batch, 1)
+    here, there, memory = _here_and_there(batch, n_cores)
     for case, speed, peer, value in (
         (f"{name} one process", LARGE / one, None, None),
+        (f"{name} one process, network", LARGE / one_there, "one process", LARGE / float(np.median(one))),
         (f"{name} {n_cores} processes", LARGE / here, "one process", LARGE / float(np.median(one))),
         (f"{name} network", LARGE / there, f"{n_cores} processes, no network", LARGE / float(np.median(here))),
     ):
@@ -75,6 +76,15 @@ def _many(batch: EmiScanBatch) -> Iterator[dict[str, object]]:
         yield _row(case, float(np.median(speed)), "scans/s", peer, value)
     print(f"emi {name} network: service and workers hold {memory:.0f} MiB")
     yield _row(f"{name} memory of service and workers", memory, "MiB")
+
+
+def _here_and_there(batch: EmiScanBatch, processes: int) -> tuple[Seconds, Seconds, float]:
+    """Seconds of repeated runs without and with a network, and the memory of the service, in MiB."""
+    with _pool(processes) as local, _service(processes) as client:
+        # In turn, so that whatever else the machine does meets both.
+        both = [(wall(lambda: local(batch), 1), wall(lambda: client.invert(batch), 1)) for _ in range(REPEATS)]
+        here, there = (np.concatenate(times) for times in zip(*both, strict=True))
+        return here, there, _memory_mib(os.getpid())
 
 
 def scans(spacing_m: float, model: str, count: int, estimator: str = "varpro") -> EmiScanBatch:
@@ -85,7 +95,7 @@ def scans(spacing_m: float, model: str, count: int, estimator: str = "varpro") -
     return simulate(geometry, random_targets(count, seed=1), 20.0, seed=1, options=options).batch
 
 
-def one_core(batch: EmiScanBatch) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def one_core(batch: EmiScanBatch) -> Seconds:
     """Scans a CPU second of repeated runs of the engine."""
     assert batch.geometry is not None
     request = to_request(batch, batch.geometry, LR_THRESHOLD)
@@ -110,7 +120,7 @@ def numpy_filter_speed() -> float:
     return 1.0 / (time.process_time() - started)
 
 
-def wall(work: Callable[[], Iterable[EmiResult]], repeats: int = 3) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def wall(work: Callable[[], Iterable[EmiResult]], repeats: int = 3) -> Seconds:
     """Seconds of repeated runs, after one that is not counted."""
     assert len(list(work())) == LARGE
     seconds = np.empty(repeats)
@@ -136,14 +146,17 @@ class _pool:  # noqa: N801 - used as a function
 
 
 class _service:  # noqa: N801 - used as a function
-    """A router, an EMI service, and a client of it, for the time of a block."""
+    """A router, an EMI service of so many processes, and a client of it, for the time of a block."""
+
+    def __init__(self, processes: int) -> None:
+        self._processes = processes
 
     def __enter__(self) -> Client:
         endpoint = f"tcp/127.0.0.1:{random.randrange(20_000, 32_000)}"
         self._folder = tempfile.TemporaryDirectory()
         self._children = Children(Path(self._folder.name))
         self._children.start("router", ["router", "--listen", endpoint])
-        self._children.start("emi", ["emi", "--connect", endpoint])
+        self._children.start("emi", ["emi", "--connect", endpoint, "--processes", str(self._processes)])
         self._bus = ZenohBus.open([endpoint], timeout_s=READY_S)
         client = Client(self._bus)
         with client.watch_statuses("emi") as statuses:
@@ -192,7 +205,7 @@ def _row(
     }  # fmt: skip
 
 
-def _line(speed: np.ndarray[tuple[int], np.dtype[np.float64]]) -> str:
+def _line(speed: Seconds) -> str:
     return f"{np.median(speed):.0f} scans/s (min {speed.min():.0f}, max {speed.max():.0f})"
 
 

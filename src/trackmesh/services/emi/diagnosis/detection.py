@@ -12,8 +12,8 @@ from trackmesh.services.emi.kernels import FloatArray, IntArray
 from trackmesh.services.emi.sensor import Sensor
 from trackmesh.services.emi.varpro import Bounds, evaluate
 
-LR_THRESHOLD = 45.0
-"""Likelihood ratio below which a scan of one channel holds no target (noise alone stays below 33 in 99 of 100)."""
+LR_THRESHOLD = 40.0
+"""Likelihood ratio below which a scan of one channel holds no target (noise alone stays below 33 in 99 of 100, below 40 in 999 of 1000)."""
 SMALL_DOF = 30
 CONFIDENT = 1.645
 """Standard deviations above the threshold with which a target is seen in 95 of 100 scans."""

@@ -37,7 +37,7 @@ EDGE_IN_DEPTHS = 0.5
 """How far outside the scan, in depths, a target is seen only from one side."""
 EDGE_SD = 0.1
 """Horizontal standard deviation, in depths, with which a target is outside as soon as it is beyond the rim."""
-DIPOLE_RADII = 6.0
+DIPOLE_RADII = 10.0
 """Depth in coil radii within which a point dipole is a rough model of a loop."""
 APART = 2.0
 """Standard deviations by which a mirror image must be away to be another place."""

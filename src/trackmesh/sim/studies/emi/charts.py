@@ -37,6 +37,7 @@ COLORS = {"varpro": "#1769aa", "ekf9": "#2a9d6f", "kf-ekf-thesis": "#d1495b", "i
 ROLLS = {"roll 0": "#1769aa", "roll 45": "#d1495b", "roll 90": "#2a9d6f"}
 OTHERS: tuple[EstimatorName, ...] = ("initial", "kf-ekf-thesis", "ekf9")
 CLAIM = "#c3c9d1"
+SIGNED_MAP = "RdBu_r"
 COMPONENTS = ("Bx", "By", "Bz", "|B|")
 
 
@@ -92,7 +93,10 @@ def draw_maps(folder: Path, here: World, name: str, body: Buried) -> Path:
     shown = [*field.T, np.linalg.norm(field, axis=1)]
     for axes, values, label in zip(figure.subplots(2, 2).ravel(), shown, COMPONENTS, strict=True):
         dress(axes)
-        filled = axes.tricontourf(place[:, 0], place[:, 1], values, levels=24, cmap=FIELD_MAP)
+        # Levels that leave out zero: where the field vanishes it has no sign to show.
+        levels = np.linspace(-1.0, 1.0, 26) * np.abs(values).max() if values.min() < 0.0 else 24
+        colours = SIGNED_MAP if values.min() < 0.0 else FIELD_MAP
+        filled = axes.tricontourf(place[:, 0], place[:, 1], values, levels=levels, cmap=colours)
         bar = figure.colorbar(filled, ax=axes, shrink=0.8, pad=0.02)
         bar.outline.set_visible(False)
         bar.ax.tick_params(labelsize=8, colors=MUTED)
@@ -185,7 +189,7 @@ def draw_convergence(folder: Path, here: World) -> Path:
         axes.plot(upto, off, color=COLORS["kf-ekf-thesis"], lw=1.8)
         dress(axes)
         title(axes, name)
-        axes.set_yscale("log")
+        axes.set_ylim(0.0, None)
         axes.set_xlabel("samples", color=MUTED)
         axes.set_ylabel("position error, cm", color=MUTED)
     figure_title(figure, "The thesis's KF-EKF as samples come in (figures 5-15 and 5-16)")
