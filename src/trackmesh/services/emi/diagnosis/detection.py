@@ -13,7 +13,10 @@ from trackmesh.services.emi.sensor import Sensor
 from trackmesh.services.emi.varpro import Bounds, evaluate
 
 LR_THRESHOLD = 40.0
-"""Likelihood ratio below which a scan of one channel holds no target (noise alone stays below 33 in 99 of 100, below 40 in 999 of 1000)."""
+"""Likelihood ratio below which a scan of one channel holds no target.
+
+Noise alone stays below 33 in 99 of 100 scans, below 40 in 999 of 1000.
+"""
 SMALL_DOF = 30
 CONFIDENT = 1.645
 """Standard deviations above the threshold with which a target is seen in 95 of 100 scans."""
