@@ -96,3 +96,8 @@ def test_another_version_is_never_heard() -> None:
 def test_parameters_are_names_and_values(text: str, parameters: dict[str, str]) -> None:
     assert parse_parameters(text) == parameters
     assert {name: zenoh.Parameters(text).get(name) for name in parameters} == parameters
+
+
+def test_a_realm_is_named() -> None:
+    with pytest.raises(TrackmeshError, match="named"):
+        Keys("*")

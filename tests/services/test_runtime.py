@@ -281,6 +281,11 @@ def start(runtime):
         runtime.spawn("failing", lambda: 1 / 0)
     if what == "broken":
         1 / 0
+    if what == "compiling":
+        runtime.set_state("compiling")
+        os.write(1, b"ready\\n")
+        while True:
+            sum(range(10_000))
     runtime.set_state("ready")
     # One write, so that no line of another thread comes between the word and its end of line.
     os.write(1, b"ready\\n")
@@ -303,6 +308,14 @@ def test_a_signal_is_a_normal_stop(processes: Processes, number: signal.Signals)
     assert process.stop(number) == EXIT_OK
     assert f"stopping: {number.name}" in process.output
     assert "Traceback" not in process.output
+
+
+@pytest.mark.process
+def test_a_signal_ends_a_service_that_still_compiles(processes: Processes) -> None:
+    process = service(processes, "compiling")
+    process.wait_for("ready")
+    assert process.stop() == EXIT_OK
+    assert "stopping: SIGTERM" in process.output
 
 
 @pytest.mark.process

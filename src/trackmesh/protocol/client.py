@@ -18,8 +18,8 @@ from typing import Generic, NamedTuple, Self, TypeVar
 
 from trackmesh.protocol.bus import Bus, Sample, Subscription
 from trackmesh.protocol.codec import decode, encode, encoding, open_envelope
-from trackmesh.protocol.errors import QueryFailed, RefusedMessage, Unavailable
-from trackmesh.protocol.inversion import Incomplete, Inversion
+from trackmesh.protocol.errors import Incomplete, QueryFailed, RefusedMessage, Unavailable
+from trackmesh.protocol.inversion import Inversion
 from trackmesh.protocol.keys import DEFAULT_REALM, Keys, kind_and_id, last_chunk
 from trackmesh.protocol.messages import (
     EmiResult,

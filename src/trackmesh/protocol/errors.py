@@ -3,7 +3,8 @@
 TrackmeshError
 ├── RefusedMessage      a message from outside that is wrong: reason (a counter's name) and one sentence
 ├── BusError            the network cannot be reached or used
-│   └── Unavailable     nobody answers a query
+│   ├── Unavailable     nobody answers a query
+│   └── Incomplete      a service ended half-way through its answer
 └── QueryFailed         a service answered a query with an error: code and one sentence
 """
 
@@ -42,6 +43,18 @@ class BusError(TrackmeshError):
 
 class Unavailable(BusError):
     """No service answered a query."""
+
+
+class Incomplete(BusError):
+    """A service ended half-way through its answer.
+
+    Attributes:
+        received: how many answers came before.
+    """
+
+    def __init__(self, sentence: str, received: int) -> None:
+        super().__init__(sentence)
+        self.received = received
 
 
 class QueryFailed(TrackmeshError):

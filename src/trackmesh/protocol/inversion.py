@@ -17,7 +17,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from trackmesh.protocol.bus import Closeable
-from trackmesh.protocol.errors import BusError, QueryFailed, RefusedMessage, TrackmeshError, Unavailable
+from trackmesh.protocol.errors import Incomplete, QueryFailed, RefusedMessage, TrackmeshError, Unavailable
 from trackmesh.protocol.messages import EmiResult, EmiScanBatch
 
 PORTION_NUMBERS = 500_000
@@ -27,18 +27,6 @@ AT_A_TIME = 2
 """Portions a service has at hand, so that it need not wait for the next one."""
 COME_BACK = ("busy", "stopping")
 """Errors that say: not this service, not now."""
-
-
-class Incomplete(BusError):
-    """A service ended half-way through its answer.
-
-    Attributes:
-        received: how many answers came before.
-    """
-
-    def __init__(self, sentence: str, received: int) -> None:
-        super().__init__(sentence)
-        self.received = received
 
 
 Ask = Callable[[str, EmiScanBatch], Iterator[EmiResult]]

@@ -26,6 +26,8 @@ class Keys:
     realm: str = DEFAULT_REALM
 
     def __post_init__(self) -> None:
+        if self.realm == "*":
+            raise TrackmeshError("A realm is named, it cannot be '*'.")
         _chunk(self.realm, "realm")
 
     def plots(self, sensor_id: str) -> str:

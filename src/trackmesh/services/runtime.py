@@ -177,7 +177,7 @@ class ServiceRuntime:
         A stop that exceeds its deadline ends the process with ``EXIT_DEADLINE``.
         """
         configure_logging(self.settings.log_level, self.settings.log_format, f"{self.kind}/{self.settings.unit_id}")
-        with on_signal(self.stop):
+        with on_signal(self._signalled):
             try:
                 self.start()
                 setup(self)
@@ -243,11 +243,21 @@ class ServiceRuntime:
             self._exit_now()
         watchdog.cancel()
 
+    def _signalled(self, name: str) -> None:
+        compiling = self._state == "compiling"
+        self.stop(name)
+        if compiling:
+            # The compiler looks at no event for a minute, and nothing is at work yet that had to end in order.
+            self._leave(EXIT_OK)
+
     def _exit_now(self) -> None:
         self.log.error("the stop took too long, leaving at once")
+        self._leave(EXIT_DEADLINE)
+
+    def _leave(self, exit_code: int) -> None:
         logging.shutdown()
         sys.stderr.flush()
-        os._exit(EXIT_DEADLINE)
+        os._exit(exit_code)
 
     def _status_loop(self) -> None:
         while not self.stopping.wait(STATUS_PERIOD_S):
