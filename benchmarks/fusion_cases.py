@@ -36,6 +36,7 @@ COLUMNS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("kept %", ("kept_pct",)),
     ("NEES", ("nees",)),
     ("15-40 s: GOSPA m / missed %", ("start_gospa_m", "start_missed_pct")),
+    ("shown after s / gone after s", ("shown_after_s", "gone_after_s")),
     ("bias error after 120 s: m / deg", ("bias_120_m", "bias_120_deg")),
     ("at the end: m / deg", ("bias_m", "bias_deg")),
     ("pairs right % / paired %", ("pairs_right_pct", "paired_pct")),
@@ -44,6 +45,7 @@ COLUMNS: tuple[tuple[str, tuple[str, ...]], ...] = (
 
 DECIMALS = {
     "gospa_m": 0, "start_gospa_m": 0, "rmse_m": 1, "switches": 1, "kept_pct": 1, "bias_120_m": 1, "bias_m": 1,
+    "shown_after_s": 1, "gone_after_s": 1,
     "bias_120_deg": 3, "bias_deg": 3,
 }  # fmt: skip
 """Others have two."""

@@ -17,6 +17,7 @@ from benchmarks.trials import (
     Kept,
     Trial,
     biased,
+    coming_and_going,
     crossing,
     crossings,
     in_pairs,
@@ -192,6 +193,12 @@ def blackout(seed: int, duration_s: float = DURATION_S) -> Trial:
     given, begin_s = trial(seed, duration_s), 0.4 * duration_s
     dark = silent(given, begin_s, begin_s + 15.0)
     return replace(dark, kept=(Kept(begin_s - 1.0, begin_s + 40.0),))
+
+
+@case("come-and-go", *_at_most(shown_after_s=8.0, gone_after_s=15.0))
+def come_and_go(seed: int, duration_s: float = DURATION_S) -> Trial:
+    """A third of the targets appears, another third is gone, at some time of the run; identities of those that stay."""
+    return coming_and_going(trial(seed, duration_s), seed)
 
 
 # --- more sensors, fewer or more targets ---

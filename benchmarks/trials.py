@@ -57,6 +57,7 @@ class Trial:
         kept: where identities are looked at.
         ticks_s: times at which the clock ticks though nothing arrives.
         bias: of each sensor, what it measures too much, in its first two columns. bias_from_s: since when.
+        lives_s: from when until when each target is there (n, 2); None: all are, always.
     """
 
     truth_t_s: FloatArray
@@ -67,6 +68,7 @@ class Trial:
     ticks_s: tuple[float, ...] = ()
     bias: dict[str, FloatArray] = field(default_factory=dict)
     bias_from_s: float = 0.0
+    lives_s: FloatArray | None = None
 
     @property
     def duration_s(self) -> float:
@@ -77,6 +79,12 @@ class Trial:
     def targets(self) -> int:
         """How many there are."""
         return int(self.truth.shape[1])
+
+    def there(self, t_s: float) -> IntArray:
+        """Rows of the targets that are there at a time."""
+        if self.lives_s is None:
+            return np.arange(self.targets)
+        return np.flatnonzero((self.lives_s[:, 0] <= t_s) & (t_s < self.lives_s[:, 1]))
 
     def state_at(self, t_s: float) -> FloatArray:
         """Truth states (n, 4) [east, north, veast, vnorth] at a time, linear between those that are known."""
@@ -140,6 +148,23 @@ def unseen(given: Trial, from_s: float, until_s: float, targets: IntArray) -> Tr
         return feed.only(~np.isin(feed.target, targets)) if from_s <= feed.t_s < until_s else feed
 
     return replace(given, feeds=tuple(map(without, given.feeds)))
+
+
+def coming_and_going(given: Trial, seed: int) -> Trial:
+    """A third of the targets comes later, another third goes before the end, at any time of the middle four fifths."""
+    rng, n = np.random.default_rng([seed, 6]), given.targets
+    lives, order = np.tile([0.0, np.inf], (n, 1)), rng.permutation(n)
+    when = rng.uniform(0.1, 0.9, n) * given.duration_s
+    come, go = order[: n // 3], order[n // 3 : 2 * (n // 3)]
+    lives[come, 0], lives[go, 1] = when[come], when[go]
+
+    def there(feed: Feed) -> Feed:
+        from_s, until_s = lives[feed.target].T
+        return feed.only((feed.target == CLUTTER) | ((from_s <= feed.t_s) & (feed.t_s < until_s)))
+
+    stay = order[2 * (n // 3) :]
+    kept = tuple(one._replace(targets=np.sort(stay)) for one in given.kept)
+    return replace(given, feeds=tuple(map(there, given.feeds)), lives_s=lives, kept=kept)
 
 
 def late(given: Trial, seed: int, most_s: float) -> Trial:

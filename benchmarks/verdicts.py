@@ -30,7 +30,8 @@ def judge(trial: Trial, settings: EngineSettings) -> dict[str, float]:
     covariance is right) are of the pictures after 40 s; ``start_gospa_m`` and ``start_missed_pct`` of those from 15 to
     40 s; ``kept_pct`` is the share of targets that keep their identity; ``bias_m`` and ``bias_deg`` are the largest
     errors of the estimated biases at the end, ``bias_120_m`` and ``bias_120_deg`` 120 s after they appear;
-    ``pairs_right_pct`` and ``paired_pct`` see ``DeclaredPairs``.
+    ``pairs_right_pct`` and ``paired_pct`` see ``DeclaredPairs``; ``shown_after_s`` and ``gone_after_s`` see
+    ``life_figures``.
     """
     engine = FusionEngine(settings, Unit())
     for sensor in trial.sensors:
@@ -41,6 +42,7 @@ def judge(trial: Trial, settings: EngineSettings) -> dict[str, float]:
     return {
         **picture_figures(trial, shown),
         "kept_pct": kept_pct(trial, shown),
+        **life_figures(trial, shown),
         **bias_figures(trial, [(t, r) for t, r in told if t <= learnt], "bias_120"),
         **bias_figures(trial, told, "bias"),
         **pairs.figures(),
@@ -76,12 +78,13 @@ def picture_figures(trial: Trial, shown: Shown) -> dict[str, float]:
     switches, last = 0, np.full(trial.targets, NOBODY)
     for t_s, frame in shown:
         live = frame.status != ENDED
-        truth, state = trial.state_at(t_s), frame.state[live]
+        there = trial.there(t_s)
+        truth, state = trial.state_at(t_s)[there], frame.state[live]
         best = match(truth[:, :2], state[:, :2], CUT_OFF_M)
-        followed, before = frame.track_id[live][best.track], last[best.target]
-        last[best.target] = followed
+        followed, before = frame.track_id[live][best.track], last[there[best.target]]
+        last[there[best.target]] = followed
         parts = best.gospa()
-        share = 100.0 * parts.missed / trial.targets
+        share = 100.0 * parts.missed / max(len(there), 1)
         if t_s < WARMUP_S:
             starts += [(parts.total_m, share)] if t_s >= START_S else []
             continue
@@ -109,6 +112,30 @@ def kept_pct(trial: Trial, shown: Shown) -> float:
     """The share of targets with the same track before and after, over all that are looked at."""
     same = [np.concatenate([np.zeros(0), _kept(trial, shown, kept)]) for kept in trial.kept]
     return 100.0 * float(np.concatenate(same).mean())
+
+
+def life_figures(trial: Trial, shown: Shown) -> dict[str, float]:
+    """Means over targets that come or go while tracks are shown.
+
+    ``shown_after_s``: from when a target is there until it has a track. ``gone_after_s``: from when it is gone until the
+    track that followed it is shown no more. Those whose moment the run does not hold are left out.
+    """
+    if trial.lives_s is None:
+        return {"shown_after_s": np.nan, "gone_after_s": np.nan}
+    first, follower = np.full(trial.targets, np.nan), np.full(trial.targets, NOBODY)
+    seen_last: dict[int, float] = {}
+    for t_s, frame in shown:
+        live = frame.status != ENDED
+        tracks, there = frame.track_id[live], trial.there(t_s)
+        seen_last.update(dict.fromkeys(tracks.tolist(), t_s))
+        best = match(trial.state_at(t_s)[there, :2], frame.state[live, :2], CUT_OFF_M)
+        rows = there[best.target]
+        first[rows] = np.where(np.isnan(first[rows]), t_s, first[rows])
+        follower[rows] = tracks[best.track]
+    begin, end = trial.lives_s.T
+    last = np.array([seen_last.get(int(track), np.nan) for track in follower])
+    went = end < trial.duration_s
+    return {"shown_after_s": _mean((first - begin)[begin > 0.0]), "gone_after_s": _mean((last - end)[went])}
 
 
 def bias_figures(trial: Trial, told: Told, name: str) -> dict[str, float]:

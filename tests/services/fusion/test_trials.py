@@ -13,6 +13,7 @@ from benchmarks.trials import (
     NORTH,
     Trial,
     biased,
+    coming_and_going,
     crossing,
     crossings,
     in_pairs,
@@ -165,3 +166,17 @@ def test_bounds_and_the_table() -> None:
     text = table({"nominal": runs})
     assert "| 105 (5) |" in text and "gospa_m <= 515<br>rmse_m <= 73" in text and "ok<br>SHORT<br>ok" in text
     assert all(case.about for case in CASES.values())
+
+
+def test_who_is_not_there_gives_no_plot_and_is_not_missed(short: Trial) -> None:
+    given = coming_and_going(short, 4)
+    assert given.lives_s is not None
+    seen = [(feed.t_s, row) for feed in given.feeds for row in feed.target[feed.target != CLUTTER].tolist()]
+    assert all(row in given.there(t_s) for t_s, row in seen)
+    assert len(given.there(0.0)) < given.targets > len(given.there(given.duration_s))
+    clutter = [sum(int((f.target == CLUTTER).sum()) for f in one.feeds) for one in (given, short)]
+    assert clutter[0] == clutter[1]
+    figures = judge(given, EngineSettings())
+    assert figures["missed"] < 1.0
+    assert 0.0 < figures["shown_after_s"] < 10.0
+    assert 0.0 < figures["gone_after_s"] < 20.0
