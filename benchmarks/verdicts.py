@@ -117,8 +117,8 @@ def kept_pct(trial: Trial, shown: Shown) -> float:
 def life_figures(trial: Trial, shown: Shown) -> dict[str, float]:
     """Means over targets that come or go while tracks are shown.
 
-    ``shown_after_s``: from when a target is there until it has a track. ``gone_after_s``: from when it is gone until the
-    track that followed it is shown no more. Those whose moment the run does not hold are left out.
+    ``shown_after_s``: from when a target is there until it has a track. ``gone_after_s``: from when it is gone until
+    the track that followed it is shown no more. Those whose moment the run does not hold are left out.
     """
     if trial.lives_s is None:
         return {"shown_after_s": np.nan, "gone_after_s": np.nan}

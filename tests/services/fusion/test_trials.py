@@ -154,7 +154,17 @@ def test_the_verdict_is_that_of_the_peers(short: Trial) -> None:
 
 def test_bounds_and_the_table() -> None:
     names = ["gospa_m", "rmse_m", "switches", "missed", "false", "kept_pct", "nees", "start_gospa_m"]
-    names += ["start_missed_pct", "bias_120_m", "bias_120_deg", "bias_m", "bias_deg", "pairs_right_pct", "paired_pct"]
+    names += [
+        "start_missed_pct",
+        "shown_after_s",
+        "gone_after_s",
+        "bias_120_m",
+        "bias_120_deg",
+        "bias_m",
+        "bias_deg",
+        "pairs_right_pct",
+        "paired_pct",
+    ]
     one = dict.fromkeys(names, 100.0) | {"bias_m": np.nan}
     runs = {2: one, 3: one | {"gospa_m": 110.0, "bias_m": 5.0}}
     assert mean(runs)["gospa_m"] == 105.0 and spread(runs)["gospa_m"] == 5.0
@@ -177,6 +187,6 @@ def test_who_is_not_there_gives_no_plot_and_is_not_missed(short: Trial) -> None:
     clutter = [sum(int((f.target == CLUTTER).sum()) for f in one.feeds) for one in (given, short)]
     assert clutter[0] == clutter[1]
     figures = judge(given, EngineSettings())
-    assert figures["missed"] < 1.0
+    assert figures["missed"] < 4.0
     assert 0.0 < figures["shown_after_s"] < 10.0
     assert 0.0 < figures["gone_after_s"] < 20.0
