@@ -135,7 +135,8 @@ def life_figures(trial: Trial, shown: Shown) -> dict[str, float]:
     begin, end = trial.lives_s.T
     last = np.array([seen_last.get(int(track), np.nan) for track in follower])
     went = end < trial.duration_s
-    return {"shown_after_s": _mean((first - begin)[begin > 0.0]), "gone_after_s": _mean((last - end)[went])}
+    delays = {"shown_after_s": (first - begin)[begin > 0.0], "gone_after_s": (last - end)[went]}
+    return {name: _mean(delay[np.isfinite(delay)]) for name, delay in delays.items()}
 
 
 def bias_figures(trial: Trial, told: Told, name: str) -> dict[str, float]:
