@@ -37,7 +37,7 @@ from trackmesh.services.estimation.bank import Models
 from trackmesh.services.estimation.gating import Mixture
 from trackmesh.services.estimation.imm_tracks import ImmTracks, strength
 from trackmesh.services.estimation.plots import Plots, make_plots
-from trackmesh.services.estimation.tracks import Filters, join_rows, make_filters
+from trackmesh.services.estimation.tracks import Filters, make_filters, with_more_rows
 
 RING = 6
 ROW = np.array([0])
@@ -169,12 +169,17 @@ def test_the_ring_of_one_track_feeds_another() -> None:
     assert layer.filters.head[0].tobytes() == fed(MODELS, [plots[0], *plots[2:]]).head[0].tobytes()
 
 
-def test_joined_rows_are_the_rows_of_both() -> None:
+def test_more_rows_leave_the_rows_there_are_and_are_as_good_as_new() -> None:
     plots = random_walk(np.random.default_rng(12), 10)
-    one, other = fed(TVIMM, plots), fed(TVIMM, plots[3:])
-    whole = join_rows(one, other)
+    one = fed(TVIMM, plots)
+    whole = with_more_rows(one, 300)
+    assert len(whole.head) == len(whole.ring) == len(one.head) + 300
     assert same(whole, one)
-    assert same(whole, other, 1, 0)
+    begin_row(TVIMM, whole, 200, plots[3])
+    for plot in plots[4:]:
+        feed_row(TVIMM, whole, 200, plot)
+    assert same(whole, fed(TVIMM, plots[3:]), 200, 0)
+    assert same(whole, one)
 
 
 # --- prediction ---

@@ -143,4 +143,4 @@ class ImmTracks:
 
     def grow(self, rows: int) -> None:
         """Add empty rows."""
-        self.filters = tracks.join_rows(self.filters, tracks.make_filters(self.models, rows, self._ring))
+        self.filters = tracks.with_more_rows(self.filters, rows)

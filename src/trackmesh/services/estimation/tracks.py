@@ -78,12 +78,23 @@ def make_filters(models: Models, n: int, k: int) -> Filters:
     )
 
 
-def join_rows(first: Filters, second: Filters) -> Filters:
-    """The rows of both, with the models and the work of the first."""
-    names = [name for name in Filters._fields if name not in ("models", "work")]
-    rows: dict[str, Any] = {name: np.concatenate((getattr(first, name), getattr(second, name))) for name in names}
-    rows["scratch"] = rows["scratch"][:SCRATCH_ROWS]
-    return first._replace(**rows)
+def with_more_rows(f: Filters, more: int) -> Filters:
+    """Filters with so many empty rows behind those there are; the models and the work are shared.
+
+    Only pages that hold something are touched: among a thousand tracks, zeros that nobody needs yet would cost more
+    than a batch.
+    """
+    names = [name for name in Filters._fields if name not in ("models", "work", "scratch")]
+    rows: dict[str, Any] = {name: _longer(getattr(f, name), more) for name in names}
+    scratch = f.scratch[:SCRATCH_ROWS]
+    rows["scratch"] = _longer(scratch, min(more, SCRATCH_ROWS - len(scratch)))
+    return f._replace(**rows)
+
+
+def _longer(array: npt.NDArray[Any], more: int) -> npt.NDArray[Any]:
+    longer = np.zeros((len(array) + more, *array.shape[1:]), array.dtype)
+    longer[: len(array)] = array
+    return longer
 
 
 @kernel
