@@ -13,9 +13,9 @@ demo: $(VENV)/ready
 test: check
 	mkdir -p out
 	$(BIN)/python -m pytest tests/services/fusion tests/services/cli > out/tests-fusion.txt 2>&1 & half=$$!; \
-		$(BIN)/python -m pytest tests --ignore=tests/services/fusion --ignore=tests/services/cli --ignore=tests/network; \
+		$(BIN)/python -m pytest tests --ignore=tests/services/fusion --ignore=tests/services/cli --ignore=tests/network --ignore=tests/hosts; \
 		rest=$$?; wait $$half; half=$$?; cat out/tests-fusion.txt; exit $$((rest | half))
-	$(BIN)/python -m pytest tests/network
+	$(BIN)/python -m pytest tests/network tests/hosts
 
 check: $(VENV)/ready
 	$(BIN)/ruff check src tests benchmarks

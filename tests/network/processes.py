@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -42,12 +42,13 @@ def wait_until(condition: Callable[[], object], what: str, timeout_s: float = 15
 class Process:
     """One child process; what it prints goes to a file."""
 
-    def __init__(self, arguments: list[str], log: Path) -> None:
+    def __init__(self, arguments: list[str], log: Path, within: Sequence[str] = ()) -> None:
         self.arguments = arguments
         self._log = log
+        command = [*within, sys.executable, *arguments]
         with log.open("ab") as out:
             self._popen = subprocess.Popen(
-                [sys.executable, *arguments], stdout=out, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, cwd=ROOT
+                command, stdout=out, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, cwd=ROOT
             )
 
     @property
@@ -88,9 +89,9 @@ class Processes:
         self._directory = directory
         self._all: list[Process] = []
 
-    def start(self, *arguments: str) -> Process:
-        """Start ``python`` with arguments, from the root of the repository."""
-        process = Process(list(arguments), self._directory / f"{len(self._all)}.log")
+    def start(self, *arguments: str, within: Sequence[str] = ()) -> Process:
+        """Start ``python`` with arguments, from the root of the repository; ``within`` as a ``Host`` has it."""
+        process = Process(list(arguments), self._directory / f"{len(self._all)}.log", within)
         self._all.append(process)
         return process
 
