@@ -7,6 +7,7 @@ import logging
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from tests.network.processes import Process, Processes, processes, wait_until
@@ -15,6 +16,7 @@ from trackmesh.protocol.client import Client, Watch
 from trackmesh.protocol.memory_bus import MemoryBus, MemoryHub
 from trackmesh.protocol.messages import SensorHealth, ServiceStatus
 from trackmesh.services.health import Counters, Latencies
+from trackmesh.services.heartbeat import ill
 from trackmesh.services.logs import configure_logging
 from trackmesh.services.runtime import EXIT_DEADLINE, EXIT_FAILED, EXIT_OK, Health, ServiceRuntime, ServiceSettings
 
@@ -344,3 +346,23 @@ def test_a_service_that_waits_for_its_router_can_be_stopped(
     process = service(processes, "waiting")
     process.wait_for("no router")
     assert process.stop() == EXIT_OK
+
+
+def test_a_heartbeat_for_probes(make: Make, tmp_path: Path) -> None:
+    path = tmp_path / "beat"
+    with make(heartbeat_file=path) as runtime:
+        assert ill(path) == ""
+        assert ill(path, ready=True) == "The service is starting."
+        runtime.set_state("ready")
+        assert ill(path, ready=True) == ""
+        before = path.read_text()
+        wait_until(lambda: path.read_text() != before, "it beats again")
+    assert ill(path, ready=True) == "The service is stopping."
+
+
+def test_a_heartbeat_that_cannot_be_written_is_told_and_counted(
+    make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with make(heartbeat_file=tmp_path / "none" / "beat") as runtime:
+        assert runtime.counters.counts()["heartbeat_errors"] >= 1
+    assert sum("no heartbeat" in record.message for record in caplog.records) == 1

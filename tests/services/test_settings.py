@@ -120,3 +120,26 @@ def test_a_wrong_file_is_named(file: Path, text: str, sentence: str) -> None:
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"Cannot read .*none\.toml: No such file"):
         Settings.load(tmp_path / "none.toml")
+
+
+def test_credentials_from_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("ca", "certificate", "key"):
+        (tmp_path / name).touch()
+        monkeypatch.setenv(f"TRACKMESH_TLS__{name.upper()}", str(tmp_path / name))
+    (tmp_path / "password").write_text("secret\nanything else\n")
+    monkeypatch.setenv("TRACKMESH_USER", "sensor.north")
+    monkeypatch.setenv("TRACKMESH_PASSWORD_FILE", str(tmp_path / "password"))
+    found = Settings.load().credentials()
+    assert (found.ca, found.certificate, found.key) == tuple(tmp_path / name for name in ("ca", "certificate", "key"))
+    assert (found.user, found.password) == ("sensor.north", "secret")
+
+
+def test_a_password_that_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "empty").touch()
+    for name, sentence in (("empty", "is empty"), ("none", "No such file")):
+        with pytest.raises(SettingsError, match=sentence):
+            Settings(user="a", password_file=tmp_path / name).credentials()
+
+
+def test_no_credentials_by_default() -> None:
+    assert Settings.load().credentials().settings() == {}

@@ -82,6 +82,10 @@ class Keys:
         """Simulated truth."""
         return self._key("truth", scenario_id)
 
+    def everything(self) -> str:
+        """All keys of the realm, as a key expression."""
+        return f"{self.realm}/{VERSION}/**"
+
     def _key(self, *chunks: str) -> str:
         return "/".join((self.realm, VERSION, *(_chunk(c, "id") for c in chunks)))
 

@@ -23,10 +23,12 @@ from zenoh import ext, handlers
 
 from trackmesh.protocol.buffer import Buffer
 from trackmesh.protocol.bus import WAITING, AliveEvent, Query, QueryHandler, Sample
+from trackmesh.protocol.credentials import Credentials
 from trackmesh.protocol.errors import BusError
 from trackmesh.protocol.keys import parse_parameters
+from trackmesh.protocol.refused import why_refused
 from trackmesh.protocol.serving import Job, QueryPool
-from trackmesh.protocol.zenoh_config import client_config, endpoints_of
+from trackmesh.protocol.zenoh_config import client_config, credentials_of, endpoints_of
 from trackmesh.protocol.zenoh_history import Undeclarable, declare_publisher, declare_subscriber
 
 _log = logging.getLogger(__name__)
@@ -186,6 +188,7 @@ class ZenohBus:
         *,
         timeout_s: float = 10.0,
         config_path: Path | None = None,
+        credentials: Credentials | None = None,
         stop: threading.Event | None = None,
     ) -> Self:
         """Join the network through a router; tries until one answers.
@@ -193,14 +196,15 @@ class ZenohBus:
         Args:
             endpoints: of the routers (``tcp/host:7447``); none means those in the file, or the local one.
             timeout_s: how long to try.
-            config_path: a JSON5 file of Zenoh settings, for TLS and the like.
+            config_path: a JSON5 file of Zenoh settings, for whatever else there is to set.
+            credentials: for routers that ask for a certificate, or for a name and a password.
             stop: ends the trying when set.
 
         Raises:
             BusError: no router answers in time, or the settings are wrong.
         """
         zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
-        config = client_config(endpoints, config_path)
+        config = client_config(endpoints, config_path, credentials)
         deadline = time.monotonic() + timeout_s
         stop = stop or threading.Event()
         for attempt in itertools.count():
@@ -212,7 +216,7 @@ class ZenohBus:
             if attempt == 0:
                 where = " or ".join(endpoints_of(config, "connect"))
                 _log.info("no router answers at %s yet, trying for %g s", where, timeout_s)
-        raise BusError(_nobody(config, config_path))
+        raise BusError(_nobody(config))
 
     def publisher(self, key: str, *, history: int = 0) -> _ZenohPublisher:
         """See ``Bus.publisher``."""
@@ -341,8 +345,9 @@ def _replies(replies: queue.SimpleQueue[zenoh.Reply | None], cancel: zenoh.Cance
         cancel.cancel()  # type: ignore[no-untyped-call]
 
 
-def _nobody(config: zenoh.Config, config_path: Path | None) -> str:
-    where = " or ".join(endpoints_of(config, "connect"))
-    if config_path is None:
-        return f"No router answers at {where}; start one with `trackmesh router`."
-    return f"No router at {where} accepts this client; RUST_LOG=zenoh=debug shows why."
+def _nobody(config: zenoh.Config) -> str:
+    endpoints = endpoints_of(config, "connect")
+    for endpoint in endpoints:
+        if reason := why_refused(endpoint, credentials_of(config)):
+            return f"The router at {endpoint} does not let us in: {reason}."
+    return f"No router answers at {' or '.join(endpoints)}; start one with `trackmesh router`."

@@ -10,6 +10,7 @@ import zenoh
 
 from trackmesh.protocol.bus import DEFAULT_ENDPOINT
 from trackmesh.protocol.codec import MAX_BYTES
+from trackmesh.protocol.credentials import Credentials
 from trackmesh.protocol.errors import BusError
 
 _SHARED: dict[str, object] = {
@@ -44,18 +45,23 @@ _ROUTER: dict[str, object] = {
 }
 
 
-def client_config(endpoints: Sequence[str], path: Path | None = None) -> zenoh.Config:
+def client_config(
+    endpoints: Sequence[str], path: Path | None = None, credentials: Credentials | None = None
+) -> zenoh.Config:
     """The settings of a client.
 
     Args:
         endpoints: of the routers, tried in turn; none means those in the file.
         path: a JSON5 file of Zenoh settings (TLS, user and password). What it leaves at Zenoh's default is set as this
             project needs it.
+        credentials: for secured links; they win over the file.
 
     Raises:
         BusError: the file cannot be read, or a setting is wrong.
     """
     config = _layered(path, _SHARED | _CLIENT)
+    for key, value in (credentials or Credentials()).settings().items():
+        _insert(config, key, value)
     if endpoints:
         _insert(config, "connect/endpoints", list(endpoints))
     elif not endpoints_of(config, "connect"):
@@ -85,6 +91,14 @@ def endpoints_of(config: zenoh.Config, what: str) -> list[str]:
     return [value] if isinstance(value, str) else list(value)
 
 
+def credentials_of(config: zenoh.Config) -> Credentials:
+    """The files of a client's configuration, wherever they were set; not the password."""
+    tls = json.loads(config.get_json("transport/link/tls"))
+    names = ("root_ca_certificate", "connect_certificate", "connect_private_key")
+    ca, certificate, key = (Path(tls[name]) if tls[name] else None for name in names)
+    return Credentials(ca, certificate, key)
+
+
 def _layered(path: Path | None, ours: Mapping[str, object]) -> zenoh.Config:
     config = _read(path) if path else zenoh.Config()
     for key, value in ours.items():
@@ -110,7 +124,9 @@ def _insert(config: zenoh.Config, key: str, value: object) -> None:
     try:
         config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
-        raise BusError(f"The Zenoh setting {key} = {value!r} is wrong: {_first_line(error)}.") from None
+        # A password is nobody's business.
+        shown = "" if key.endswith("password") else f" = {value!r}"
+        raise BusError(f"The Zenoh setting {key}{shown} is wrong: {_first_line(error)}.") from None
 
 
 def _first_line(error: zenoh.ZError) -> str:

@@ -19,12 +19,14 @@ import zenoh
 from trackmesh.protocol.bus import DEFAULT_ENDPOINT
 from trackmesh.protocol.errors import BusError, TrackmeshError
 from trackmesh.protocol.zenoh_config import endpoints_of, router_config
+from trackmesh.services.heartbeat import beat
 from trackmesh.services.logs import LogFormat, LogLevel, configure_logging
 from trackmesh.services.process import EXIT_DEADLINE, EXIT_FAILED, EXIT_OK, on_signal
 
 _log = logging.getLogger("trackmesh.router")
 
 CLOSE_DEADLINE_S = 3.0
+HEARTBEAT_S = 1.0
 
 
 class Router:
@@ -62,8 +64,15 @@ class Router:
         return []
 
 
-def run_router(listen: Sequence[str] = (), config_path: Path | None = None, stop: threading.Event | None = None) -> int:
+def run_router(
+    listen: Sequence[str] = (),
+    config_path: Path | None = None,
+    stop: threading.Event | None = None,
+    heartbeat: Path | None = None,
+) -> int:
     """Route until ``stop`` is set; the exit code.
+
+    With ``heartbeat`` that file is rewritten every second, see ``services.heartbeat``.
 
     Raises:
         BusError: see ``Router``.
@@ -78,7 +87,7 @@ def run_router(listen: Sequence[str] = (), config_path: Path | None = None, stop
         " ".join(router.locators),
         extra={"locators": router.locators},
     )
-    stop.wait()
+    _wait(stop, heartbeat)
     if router.close():
         _log.info("stopped")
         return EXIT_OK
@@ -86,18 +95,30 @@ def run_router(listen: Sequence[str] = (), config_path: Path | None = None, stop
     return EXIT_DEADLINE
 
 
+def _wait(stop: threading.Event, heartbeat: Path | None) -> None:
+    while heartbeat is not None and not stop.is_set():
+        try:
+            beat(heartbeat, "ready")
+        except OSError as error:
+            _log.error("no heartbeat, %s: %s", error.filename, error.strerror)
+            break
+        stop.wait(HEARTBEAT_S)
+    stop.wait()
+
+
 def serve(
     listen: Sequence[str] = (),
     config_path: Path | None = None,
     log_level: LogLevel = "info",
     log_format: LogFormat = "human",
+    heartbeat: Path | None = None,
 ) -> int:
     """Be the router of this process, until SIGTERM or SIGINT; the exit code."""
     configure_logging(log_level, log_format, "router")
     stop = threading.Event()
     with on_signal(lambda _name: stop.set()):
         try:
-            code = run_router(listen, config_path, stop)
+            code = run_router(listen, config_path, stop, heartbeat)
         except TrackmeshError as error:
             _log.error("%s", error)
             return EXIT_FAILED

@@ -34,6 +34,7 @@ from trackmesh.protocol.errors import TrackmeshError
 from trackmesh.protocol.keys import Keys
 from trackmesh.protocol.messages import ServiceStatus
 from trackmesh.services.health import Counters, Health, Latencies
+from trackmesh.services.heartbeat import beat
 from trackmesh.services.logs import configure_logging
 from trackmesh.services.process import EXIT_DEADLINE, EXIT_FAILED, EXIT_OK, on_signal
 from trackmesh.services.settings import ServiceSettings, SettingsError, Texts
@@ -206,6 +207,7 @@ class ServiceRuntime:
             self.settings.endpoints(),
             timeout_s=self.settings.connect_timeout_s,
             config_path=self.settings.zenoh_config,
+            credentials=self.settings.credentials(),
             stop=self.stopping,
         )
 
@@ -270,6 +272,17 @@ class ServiceRuntime:
             status = self._status_now()
             self._seq += 1
             self._status.put(encode(status), encoding(status))
+            self._beat()
+
+    def _beat(self) -> None:
+        if self.settings.heartbeat_file is None:
+            return
+        try:
+            beat(self.settings.heartbeat_file, self._state)
+        except OSError as error:
+            self.counters.count("heartbeat_errors")
+            if self._seq == 1:
+                self.log.error("no heartbeat, %s: %s", error.filename, error.strerror)
 
     def _status_now(self) -> ServiceStatus:
         try:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_settings import (
     BaseSettings,
     EnvSettingsSource,
@@ -18,6 +18,7 @@ from pydantic_settings import (
 from pydantic_settings import SettingsError as _SourceError
 
 from trackmesh.protocol.bus import DEFAULT_ENDPOINT
+from trackmesh.protocol.credentials import Credentials
 from trackmesh.protocol.errors import TrackmeshError
 from trackmesh.protocol.keys import DEFAULT_REALM
 from trackmesh.protocol.messages.base import Id, Positive
@@ -40,6 +41,16 @@ Texts = Annotated[list[str], NoDecode, BeforeValidator(_split)]
 """A list of strings; in the environment and in flags separated by commas."""
 
 
+class TlsSettings(BaseModel):
+    """Files for ``tls/`` endpoints, all PEM."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    ca: Path | None = Field(None, description="certificates of who may vouch for a router")
+    certificate: Path | None = Field(None, description="our own certificate, where routers ask for one")
+    key: Path | None = Field(None, description="its private key")
+
+
 class ServiceSettings(BaseSettings):
     """What every service can be told; a service adds its own by subclassing.
 
@@ -56,7 +67,11 @@ class ServiceSettings(BaseSettings):
     connect: Annotated[Texts, Field(min_length=1, description="endpoints of the routers, tried in turn")] = [
         DEFAULT_ENDPOINT
     ]
-    zenoh_config: Path | None = Field(None, description="JSON5 file of Zenoh settings (TLS, user and password)")
+    tls: TlsSettings = TlsSettings(ca=None, certificate=None, key=None)
+    user: str | None = Field(None, description="our name, where routers ask for a password")
+    password_file: Path | None = Field(None, description="its first line is the password")
+    zenoh_config: Path | None = Field(None, description="JSON5 file of Zenoh settings, for what is not settings here")
+    heartbeat_file: Path | None = Field(None, description="rewritten every second, for probes of health")
     connect_timeout_s: Positive = Field(30.0, description="how long to wait for a router at start")
     log_level: LogLevel = "info"
     log_format: LogFormat = "human"
@@ -101,6 +116,28 @@ class ServiceSettings(BaseSettings):
     def endpoints(self) -> list[str]:
         """Where to connect; empty if that is left to the Zenoh file."""
         return self.connect if "connect" in self.model_fields_set or self.zenoh_config is None else []
+
+    def credentials(self) -> Credentials:
+        """What proves who we are to a router.
+
+        Raises:
+            SettingsError: the password cannot be read.
+            BusError: a file of TLS cannot be read, or one of a pair is missing.
+        """
+        password = _first_line(self.password_file) if self.password_file else None
+        return Credentials(self.tls.ca, self.tls.certificate, self.tls.key, self.user, password)
+
+
+def _first_line(path: Path) -> str:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise SettingsError(f"Cannot read the password file {path}: {error.strerror}.") from None
+    except UnicodeDecodeError:
+        raise SettingsError(f"The password file {path} is no text.") from None
+    if not lines or not lines[0].strip():
+        raise SettingsError(f"The password file {path} is empty.")
+    return lines[0].strip()
 
 
 def _environment(cls: type[BaseSettings]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from trackmesh.services.cli import files, induction, network, services, studies, tags
+from trackmesh.services.cli import deployment, files, induction, network, services, studies, tags
 from trackmesh.services.cli.demo import demo
 from trackmesh.services.cli.scoring import score
 from trackmesh.services.cli.tuning import tune
@@ -38,11 +38,13 @@ for command in (
     *(services.router, services.fusion, services.emi, tags.tags),
     *(network.watch, network.tracks, network.sensors, network.status, network.play, induction.invert),
     *(files.track, tags.locate, score, tune, files.plot, files.schema, studies.study),
+    deployment.router_config,
 ):
     app.command()(command)
 app.add_typer(services.sim, name="sim")
 files.convert.command("emi-csv")(induction.convert_emi_csv)
 app.add_typer(files.convert, name="convert")
+app.add_typer(deployment.certs, name="certs")
 
 
 def main() -> None:

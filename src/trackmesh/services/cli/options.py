@@ -98,7 +98,12 @@ def client(connect: str | None, realm: str | None, config: Path | None = None) -
 
     settings = ServiceSettings.load(config, {"connect": connect, "realm": realm})
     patience_s = settings.connect_timeout_s if "connect_timeout_s" in settings.model_fields_set else PATIENCE_S
-    with ZenohBus.open(settings.endpoints(), timeout_s=patience_s, config_path=settings.zenoh_config) as bus:
+    with ZenohBus.open(
+        settings.endpoints(),
+        timeout_s=patience_s,
+        config_path=settings.zenoh_config,
+        credentials=settings.credentials(),
+    ) as bus:
         yield Client(bus, settings.realm)
 
 

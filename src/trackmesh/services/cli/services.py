@@ -61,7 +61,8 @@ def router(
     from trackmesh.services.router import serve
 
     settings = ServiceSettings.load(None, given(log_level=log_level, log_format=log_format))
-    raise typer.Exit(serve(listen.split(",") if listen else [], config, settings.log_level, settings.log_format))
+    endpoints = listen.split(",") if listen else []
+    raise typer.Exit(serve(endpoints, config, settings.log_level, settings.log_format, settings.heartbeat_file))
 
 
 @told
