@@ -1,95 +1,165 @@
-"""Encrypted and authenticated links, by nothing but Zenoh settings in a file."""
+"""Secured links and rights, with real routers on this host; ``tests/hosts`` has a whole deployment."""
 
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
-from collections.abc import Mapping
+import time
 from pathlib import Path
 
 import pytest
-from tests.network.processes import Processes, free_port
+from tests.network.processes import Processes, free_port, wait_until
+from tests.network.secured import KEYS, Deployment, arrives, waiting
 
+from trackmesh.protocol.credentials import Credentials
 from trackmesh.protocol.errors import BusError
 from trackmesh.protocol.zenoh_bus import ZenohBus
+from trackmesh.services.deployment.authority import create_authority, issue
+from trackmesh.services.deployment.plan import Limits, Participant, Plan, RouterPlan
+from trackmesh.services.deployment.router_file import router_file
+from trackmesh.services.deployment.users import updated_users, write_users
 
-pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
-
-_KEY = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2"]
-
-
-def openssl(directory: Path, *arguments: str) -> None:
-    subprocess.run(["openssl", *arguments], cwd=directory, check=True, capture_output=True)
-
-
-def certify(directory: Path, name: str, extension: str) -> None:
-    """A key and a certificate of our authority: ``name.key``, ``name.pem``."""
-    (directory / "ext").write_text(extension)
-    openssl(directory, "req", *_KEY, "-keyout", f"{name}.key", "-out", f"{name}.csr", "-subj", f"/CN={name}")
-    signed = ["-CA", "ca.pem", "-CAkey", "ca.key", "-CAcreateserial", "-days", "2", "-extfile", "ext"]
-    openssl(directory, "x509", "-req", "-in", f"{name}.csr", *signed, "-out", f"{name}.pem")
+EVERYBODY = {"sensor": ["north", "east"], "archive": ["disk"], "viewer": ["ops"]}
+HOSTS = ["localhost", "127.0.0.1"]
 
 
-@pytest.fixture(scope="module")
-def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("keys")
-    openssl(directory, "req", "-x509", *_KEY, "-keyout", "ca.key", "-out", "ca.pem", "-subj", "/CN=test")
-    certify(directory, "router", "subjectAltName=IP:127.0.0.1\nextendedKeyUsage=serverAuth")
-    certify(directory, "sensor", "extendedKeyUsage=clientAuth")
-    return directory
+def plan(*, limits: Limits | None = None) -> Plan:
+    router = RouterPlan(listen=[f"tls/127.0.0.1:{free_port()}"], hosts=HOSTS)
+    return Plan(routers={"main": router}, participants=EVERYBODY, limits=limits or Limits())
 
 
-def settings(path: Path, tls: Mapping[str, object], **top: object) -> Path:
-    path.write_text(json.dumps({"transport": {"link": {"tls": tls}}, **top}))
-    return path
-
-
-def test_both_sides_show_certificates(processes: Processes, keys: Path, tmp_path: Path) -> None:
-    endpoint = f"tls/127.0.0.1:{free_port()}"
-    authority = {"root_ca_certificate": str(keys / "ca.pem")}
-    listening = {"listen_private_key": str(keys / "router.key"), "listen_certificate": str(keys / "router.pem")}
-    connecting = {"connect_private_key": str(keys / "sensor.key"), "connect_certificate": str(keys / "sensor.pem")}
-    of_router = settings(
-        tmp_path / "router.json5",
-        authority | listening | {"enable_mtls": True},
-        mode="router",
-        listen={"endpoints": [endpoint]},
-    )
-    good = settings(tmp_path / "good.json5", authority | connecting | {"enable_mtls": True})
-    nameless = settings(tmp_path / "nameless.json5", authority)
-    processes.start("-m", "trackmesh.services.router", "--config", str(of_router)).wait_for("ready after")
-
-    with ZenohBus.open([endpoint], config_path=good, timeout_s=10.0) as bus:
-        token = bus.declare_alive("secure/@v1/live/sensor/a")
-        assert bus.watch_alive("secure/@v1/live/**").receive(5.0)
-        token.close()
-    for refused in (nameless, None):
-        with pytest.raises(BusError, match="No router"):
-            ZenohBus.open([endpoint], config_path=refused, timeout_s=0.5)
+def test_settings_in_a_file_of_zenoh_do_as_well(processes: Processes, tmp_path: Path) -> None:
+    made = Deployment(plan(), tmp_path)
+    made.router(processes)
+    who = made.credentials("viewer.ops")
+    path = tmp_path / "client.json5"
+    tls = {"root_ca_certificate": who.ca, "connect_certificate": who.certificate, "connect_private_key": who.key}
+    texts = {name: str(file) for name, file in tls.items()}
+    path.write_text(json.dumps({"transport": {"link": {"tls": texts | {"enable_mtls": True}}}}))
+    with ZenohBus.open([made.endpoint()], config_path=path, timeout_s=5.0) as bus:
+        assert bus.alive(KEYS.live("*", "*")) == []
 
 
 def test_the_endpoint_may_stand_in_the_file(processes: Processes, tmp_path: Path) -> None:
     router = processes.router()
-    path = settings(tmp_path / "client.json5", {}, connect={"endpoints": [router.endpoint]})
+    path = tmp_path / "client.json5"
+    path.write_text(json.dumps({"connect": {"endpoints": [router.endpoint]}}))
     with ZenohBus.open([], config_path=path, timeout_s=5.0) as bus:
         assert bus.alive("none/@v1/**") == []
 
 
-def test_a_user_without_the_password_is_refused(processes: Processes, tmp_path: Path) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    (tmp_path / "users.txt").write_text("north:secret\n")
-    of_router = tmp_path / "router.json5"
-    auth = {"usrpwd": {"user": "router", "password": "x", "dictionary_file": str(tmp_path / "users.txt")}}
-    of_router.write_text(json.dumps({"transport": {"auth": auth}}))
-    processes.start("-m", "trackmesh.services.router", "--config", str(of_router), "--listen", endpoint).wait_for(
-        "ready after"
-    )
-    for password, welcome in (("secret", True), ("guess", False)):
-        path = tmp_path / f"{password}.json5"
-        path.write_text(json.dumps({"transport": {"auth": {"usrpwd": {"user": "north", "password": password}}}}))
-        if welcome:
-            ZenohBus.open([endpoint], config_path=path, timeout_s=5.0).close()
-        else:
-            with pytest.raises(BusError, match="accepts this client"):
-                ZenohBus.open([endpoint], config_path=path, timeout_s=0.5)
+def test_who_is_not_let_in_reads_why(processes: Processes, tmp_path: Path) -> None:
+    made = Deployment(plan(), tmp_path / "ours")
+    made.router(processes)
+    create_authority(tmp_path / "other")
+    stranger = Participant("viewer", "ops")
+    issue(tmp_path / "other", stranger)
+    issue(made.folder, Participant("viewer", "late"), days=0)
+    ours, port = made.folder / "ca.pem", made.endpoint().rpartition(":")[2]
+    files = (tmp_path / "other" / "viewer.ops.pem", tmp_path / "other" / "viewer.ops.key")
+    cases = {
+        "for tls/ a ca must be set": (Credentials(), made.endpoint()),
+        "it asks for a certificate": (Credentials(ca=ours), made.endpoint()),
+        "our certificate is of an authority that it does not know": (Credentials(ours, *files), made.endpoint()),
+        "our certificate has ended": (made.credentials("viewer.late"), made.endpoint()),
+        "unable to get local issuer": (Credentials(tmp_path / "other" / "ca.pem", *files), made.endpoint()),
+        "it may want tls/": (made.credentials("viewer.ops"), f"tcp/127.0.0.1:{port}"),
+        "start one with": (made.credentials("viewer.ops"), f"tls/127.0.0.1:{free_port()}"),
+    }
+    for reason, (credentials, endpoint) in cases.items():
+        with pytest.raises(BusError) as error:
+            ZenohBus.open([endpoint], credentials=credentials, timeout_s=0.3)
+        assert reason in str(error.value)
+
+
+def test_a_link_ends_with_the_certificate(processes: Processes, tmp_path: Path) -> None:
+    made = Deployment(plan(), tmp_path)
+    made.router(processes)
+    issue(tmp_path, Participant("sensor", "north"), days=6.0 / 86_400, renew=True)
+    with made.bus("viewer.ops") as viewer, made.bus("sensor.north") as sensor:
+        sensor.declare_alive(KEYS.live("sensor", "north"))
+        wait_until(lambda: viewer.alive(KEYS.live("*", "*")), "the sensor is there")
+        wait_until(lambda: not viewer.alive(KEYS.live("*", "*")), "the sensor is put out")
+
+
+def test_while_authorities_change_both_are_trusted(processes: Processes, tmp_path: Path) -> None:
+    made = Deployment(plan(), tmp_path / "old")
+    create_authority(tmp_path / "next")
+    fresh = Participant("viewer", "ops")
+    issue(tmp_path / "next", fresh)
+    both = (tmp_path / "next" / "ca.pem").read_text() + (made.folder / "ca.pem").read_text()
+    (made.folder / "ca.pem").write_text(both)
+    made.router(processes)
+    certificate, key = (tmp_path / "next" / f"viewer.ops.{end}" for end in ("pem", "key"))
+    renewed = Credentials(made.folder / "ca.pem", certificate, key)
+    with made.bus("viewer.ops"):
+        pass
+    with ZenohBus.open([made.endpoint()], credentials=renewed, timeout_s=5.0):
+        pass
+
+
+def test_a_router_drops_what_is_too_large(processes: Processes, tmp_path: Path) -> None:
+    made = Deployment(plan(limits=Limits(plots_bytes=2000)), tmp_path)
+    made.router(processes)
+    with made.bus("archive.disk") as ear, made.bus("sensor.north") as north:
+        plots, fence = KEYS.plots("north"), KEYS.sensor("north")
+        assert arrives(north, ear, plots, fence, b"x" * 2001) == 0
+        assert arrives(north, ear, plots, fence, b"x" * 2000) > 0
+
+
+def test_a_router_passes_on_no_more_than_its_rate(processes: Processes, tmp_path: Path) -> None:
+    made = Deployment(plan(limits=Limits(plots_per_s=10.0)), tmp_path)
+    made.router(processes)
+    with made.bus("archive.disk") as ear, made.bus("sensor.north") as north:
+        heard, flood = ear.subscribe(KEYS.plots("north")), north.publisher(KEYS.plots("north"))
+
+        def begun() -> bool:
+            flood.put(b"x", "")
+            return heard.receive(0.05) is not None
+
+        wait_until(begun, "the flood begins")
+        began_s = time.monotonic()
+        for _ in range(2000):
+            flood.put(b"x", "")
+        assert arrives(north, ear, KEYS.status("sim-radar", "north"), KEYS.sensor("north")) > 0
+        assert waiting(heard) <= 10.0 * (time.monotonic() - began_s) + 1
+
+
+def test_names_and_passwords(processes: Processes, tmp_path: Path) -> None:
+    router = RouterPlan(listen=[f"tcp/127.0.0.1:{free_port()}"])
+    secured = Plan(security="passwords", folder=str(tmp_path), routers={"main": router}, participants=EVERYBODY)
+    users = updated_users(secured, {})
+    write_users(tmp_path / "users.txt", users)
+    path = tmp_path / "router.json5"
+    path.write_text(router_file(secured, password=users["router.main"]))
+    processes.start("-m", "trackmesh.services.router", "--config", str(path)).wait_for("ready after")
+
+    def enter(name: str, password: str) -> ZenohBus:
+        return ZenohBus.open(router.listen, credentials=Credentials(user=name, password=password), timeout_s=0.5)
+
+    with enter("archive.disk", users["archive.disk"]) as ear, enter("sensor.north", users["sensor.north"]) as north:
+        assert arrives(north, ear, KEYS.plots("north"), KEYS.sensor("north")) > 0
+        assert arrives(north, ear, KEYS.plots("east"), KEYS.sensor("north")) == 0
+    for name, password in (("sensor.north", "guess"), ("sensor.none", users["sensor.north"])):
+        with pytest.raises(BusError, match="it may want tls/, or a user and password"):
+            enter(name, password)
+    with pytest.raises(BusError):
+        ZenohBus.open(router.listen, timeout_s=0.5)
+
+
+def test_two_sites_are_one_realm(processes: Processes, tmp_path: Path) -> None:
+    ports = [free_port(), free_port()]
+    listen = [f"tls/127.0.0.1:{port}" for port in ports]
+    sites = {
+        "a": RouterPlan(listen=[listen[0]], hosts=HOSTS),
+        "b": RouterPlan(listen=[listen[1]], hosts=HOSTS, connect=[listen[0]]),
+    }
+    made = Deployment(Plan(routers=sites, participants=EVERYBODY), tmp_path)
+    # The one that is to be joined may come later.
+    made.router(processes, "b")
+    other = made.router(processes, "a")
+    with made.bus("sensor.north", listen[0]) as north, made.bus("archive.disk", listen[1]) as ear:
+        assert arrives(north, ear, KEYS.plots("north"), KEYS.sensor("north")) > 0
+        assert arrives(north, ear, KEYS.plots("east"), KEYS.sensor("north")) == 0
+    other.kill()
+    with made.bus("sensor.east", listen[1]) as east, made.bus("archive.disk", listen[1]) as ear:
+        assert arrives(east, ear, KEYS.plots("east"), KEYS.sensor("east")) > 0
