@@ -227,6 +227,7 @@ class Work(Protocol):
     Attributes:
         pi: (r, width) transition matrix of each branch, one below the other. step: (width, width) of one.
         weight: (width, width) share of model a in what comes to model j. power, F, product, block, gain: scratch.
+        apart, moment, off: (width, 4), (width, 4, 4), (4,) what mixing needs of each model.
         x, P, y, C, Y: (width, ...) what mixing gives.
         before, c, log_likelihood: (r,).
         repairs: how often a covariance that was none had to be replaced.
@@ -240,6 +241,9 @@ class Work(Protocol):
     product: FloatArray
     block: FloatArray
     gain: FloatArray
+    apart: FloatArray
+    moment: FloatArray
+    off: FloatArray
     x: FloatArray
     P: FloatArray
     y: FloatArray
@@ -263,6 +267,9 @@ def make_work(models: Models) -> Work:
         "product": (6, 6),
         "block": (6,),
         "gain": (6, 2),
+        "apart": (width, 4),
+        "moment": (width, 4, 4),
+        "off": (4,),
         "x": (width, d),
         "P": (width, d, d),
         "y": (width, 4),

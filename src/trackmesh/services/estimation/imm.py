@@ -113,22 +113,31 @@ def step_matrix(models: Models, s: State, branch: int, dt_s: float, w: Work) -> 
                 w.pi[a, b] = s.counts[a, b]
         return
     if models.has_modes[branch]:
-        transition_by_modes(models.mode_rate[branch], models.mode_left[branch], models.mode_right[branch], dt_s, w.step)
+        # The rest are states that are never left.
+        rate = models.mode_rate[branch, :n]
+        transition_by_modes(rate, models.mode_left[branch], models.mode_right[branch], dt_s, w.step, w.power)
     else:
         transition_matrix(models.jump[branch], models.rate[branch], dt_s, w.step, w.power)
     prior = models.prior_count[branch]
     learns = np.isfinite(prior)
     for a in range(n):
-        total = 1.0
-        if learns:
-            total = 0.0
-            for b in range(n):
-                w.step[a, b] = prior * w.step[a, b] + s.counts[low + a, b]
-                total += w.step[a, b]
         for b in range(n):
-            w.pi[low + a, b] = w.step[a, b] / total
+            w.pi[low + a, b] = w.step[a, b]
+        if learns:
+            _learn_row(w.pi[low + a], s.counts[low + a], prior, n)
         if models.age_s[low + a] > 0.0:
             _hold_by_age(w.pi[low + a], a, n, (s.age_s[low + a] + 0.5 * dt_s) / models.age_s[low + a])
+
+
+@kernel
+def _learn_row(row: FloatArray, counts: FloatArray, prior: float, n: int) -> None:
+    """Mean of the Dirichlet posterior, in place of its prior's."""
+    total = 0.0
+    for b in range(n):
+        row[b] = prior * row[b] + counts[b]
+        total += row[b]
+    for b in range(n):
+        row[b] /= total
 
 
 @kernel
@@ -152,6 +161,7 @@ def mix(models: Models, s: State, low: int, high: int, dt_s: float, w: Work) -> 
     prior, uncorrelated with everything.
     """
     n = high - low
+    _second_moments(s, low, n, w)
     for j in range(n):
         c = 0.0
         for a in range(n):
@@ -178,22 +188,38 @@ def mix(models: Models, s: State, low: int, high: int, dt_s: float, w: Work) -> 
 
 
 @kernel
+def _second_moments(s: State, low: int, n: int, w: Work) -> None:
+    """Means and second moments of the models of a branch about the first one's mean, upper triangles.
+
+    They are needed once for each model here, not once for each pair of models. About the plane's origin they would lose
+    the digits that tell models apart.
+    """
+    for a in range(n):
+        for k in range(4):
+            w.apart[a, k] = s.x[low + a, k] - s.x[low, k]
+        for k in range(4):
+            for m in range(k, 4):
+                w.moment[a, k, m] = s.P[low + a, k, m] + w.apart[a, k] * w.apart[a, m]
+
+
+@kernel
 def _mix_motion(s: State, j: int, low: int, n: int, w: Work) -> None:
-    """Position and velocity that come to the j-th model of a branch, upper triangle of the covariance."""
+    """Position and velocity that come to the j-th model of a branch, upper triangle of the covariance.
+
+    With d = x0 - ref, P0 = sum_a W_a (P_a + (x_a - ref)(x_a - ref)^T) - d d^T for any ref.
+    """
     for k in range(4):
-        value = 0.0
+        off = 0.0
         for a in range(n):
-            value += w.weight[a, j] * s.x[low + a, k]
-        w.x[j, k] = value
+            off += w.weight[a, j] * w.apart[a, k]
+        w.off[k] = off
+        w.x[j, k] = s.x[low, k] + off
     for k in range(4):
         for m in range(k, 4):
-            w.P[j, k, m] = 0.0
-    for a in range(n):
-        weight = w.weight[a, j]
-        for k in range(4):
-            dk = s.x[low + a, k] - w.x[j, k]
-            for m in range(k, 4):
-                w.P[j, k, m] += weight * (s.P[low + a, k, m] + dk * (s.x[low + a, m] - w.x[j, m]))
+            value = -w.off[k] * w.off[m]
+            for a in range(n):
+                value += w.weight[a, j] * w.moment[a, k, m]
+            w.P[j, k, m] = value
 
 
 @kernel

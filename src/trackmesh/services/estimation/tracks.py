@@ -187,21 +187,31 @@ def estimate(f: Filters, rows: IntArray, t_s: FloatArray) -> tuple[FloatArray, F
     """
     m, r = len(rows), len(f.models[0].kind)
     mean, covariance, probability = np.zeros((m, 4)), np.zeros((m, 4, 4)), np.zeros((m, r))
-    one = Mixture(np.empty((1, r, 4)), np.empty((1, r, 4, 4)), np.empty((1, r)))
     for k in range(m):
-        if not _predict_one(f, rows[k], t_s[k], 0, one, 0):
+        if not _predict_state(f, rows[k], t_s[k], 0):
             continue
-        probability[k] = one.mu[0]
+        state = f.scratch[0]
+        imm.probabilities(f.models[0], state, probability[k])
         if f.models[0].printed:
-            printed.product_of_gaussians(one.x[0], one.P[0], mean[k], covariance[k])
+            printed.product_of_gaussians(state.x, state.P, mean[k], covariance[k])
         else:
-            imm.moment_match(one.x[0], one.P[0], one.mu[0], mean[k], covariance[k])
+            imm.moment_match(state.x, state.P, probability[k], mean[k], covariance[k])
     return mean, covariance, probability
 
 
 @kernel
 def _predict_one(f: Filters, i: int, t_s: float, place: int, out: Mixture, k: int) -> bool:
-    """Predict row ``i`` into ``scratch[place]``, and write it as mixture ``k``."""
+    """As ``_predict_state``, and write it as mixture ``k``."""
+    if not _predict_state(f, i, t_s, place):
+        return False
+    state = f.scratch[place]
+    imm.write_mixture(f.models[0], state, state.x, state.P, out, k)
+    return True
+
+
+@kernel
+def _predict_state(f: Filters, i: int, t_s: float, place: int) -> bool:
+    """Predict row ``i`` to a time into ``scratch[place]``; False before its base."""
     if t_s >= f.head[i].t_s:
         f.scratch[place] = f.head[i]
     elif t_s >= f.base[i].t_s:
@@ -213,9 +223,7 @@ def _predict_one(f: Filters, i: int, t_s: float, place: int, out: Mixture, k: in
             imm.filter_plot(f.models[0], f.scratch[place], f.ring[i, h], f.work[0])
     else:
         return False
-    state = f.scratch[place]
-    imm.interact(f.models[0], state, t_s, f.work[0])
-    imm.write_mixture(f.models[0], state, state.x, state.P, out, k)
+    imm.interact(f.models[0], f.scratch[place], t_s, f.work[0])
     return True
 
 

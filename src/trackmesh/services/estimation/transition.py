@@ -94,25 +94,33 @@ def modes(G: FloatArray, size: int) -> Modes:
 
 
 @kernel
-def transition_by_modes(rate: FloatArray, left: FloatArray, right: FloatArray, dt_s: float, out: FloatArray) -> None:
+def transition_by_modes(
+    rate: FloatArray, left: FloatArray, right: FloatArray, dt_s: float, out: FloatArray, work: FloatArray
+) -> None:
     """Write Pi(dt) = left diag(exp(rate dt)) right into ``out`` (r, r); rows sum to one, nothing is negative.
 
-    Four times as fast as ``transition_matrix``, for chains that have such a form (see ``Modes``).
+    Several times as fast as ``transition_matrix``, for chains that have such a form (see ``Modes``).
+
+    Args:
+        rate, left, right: of ``Modes``, the matrices at least (r, r). dt_s: >= 0.
+        work: (>= r, >= r) scratch.
     """
     r = len(rate)
-    for i in range(r):
-        for j in range(r):
-            out[i, j] = 0.0
     for k in range(r):
         decay = np.exp(rate[k] * dt_s)
         for i in range(r):
-            share = left[i, k] * decay
-            for j in range(r):
-                out[i, j] += share * right[k, j]
+            work[i, k] = left[i, k] * decay
     for i in range(r):
+        total = 0.0
         for j in range(r):
-            out[i, j] = max(out[i, j], 0.0)
-    _normalise_rows(out)
+            value = 0.0
+            for k in range(r):
+                value += work[i, k] * right[k, j]
+            out[i, j] = max(value, 0.0)
+            total += out[i, j]
+        scale = 1.0 / total
+        for j in range(r):
+            out[i, j] *= scale
 
 
 @kernel
