@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SECONDS_ ?= 60
 
-.PHONY: demo test check studies bench lock clean
+.PHONY: demo test check studies bench docker-check lock clean
 
 demo: $(VENV)/ready
 	$(BIN)/trackmesh demo --seconds $(SECONDS_)
@@ -30,6 +30,10 @@ studies: $(VENV)/ready
 
 bench: $(VENV)/ready
 	$(BIN)/python -m benchmarks.run
+
+# The image, built and run without a Docker daemon: as root, with buildah; BASE=local where there is no registry.
+docker-check: $(VENV)/ready
+	docker/check
 
 $(VENV)/ready: pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "trackmesh needs Python 3.11 or newer")'

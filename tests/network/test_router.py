@@ -12,7 +12,7 @@ from tests.network.processes import ROOT, Processes, free_port, wait_until
 from trackmesh.protocol.zenoh_bus import ZenohBus
 from trackmesh.protocol.zenoh_config import endpoints_of, router_config
 
-SHIPPED = ROOT / "docker" / "router.json5"
+SHIPPED = ROOT / "docker" / "open.json5"
 
 
 def test_the_shipped_settings_are_those_of_the_code() -> None:

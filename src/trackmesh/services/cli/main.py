@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from trackmesh.services.cli import deployment, files, induction, network, services, studies, tags
+from trackmesh.services.cli.compiling import compile_
 from trackmesh.services.cli.demo import demo
 from trackmesh.services.cli.scoring import score
 from trackmesh.services.cli.tuning import tune
@@ -41,6 +42,7 @@ for command in (
     deployment.router_config,
 ):
     app.command()(command)
+app.command("compile")(compile_)
 app.add_typer(services.sim, name="sim")
 files.convert.command("emi-csv")(induction.convert_emi_csv)
 app.add_typer(files.convert, name="convert")

@@ -32,6 +32,16 @@ StartNs = Annotated[
         help="When the scenario began, UTC nanoseconds; default: now. Sensors of one world need the same.",
     ),
 ]
+StartEvery = Annotated[
+    float | None,
+    typer.Option(
+        "--start-every",
+        min=1.0,
+        metavar="S",
+        help="The scenario began at the last multiple of S seconds, and ends at the next. So sensors that are started"
+        " apart see one world, and one that is always started again sees it again.",
+    ),
+]
 
 sim = typer.Typer(help="Simulated sensors: live, or as a recording.", no_args_is_help=True)
 
@@ -141,11 +151,33 @@ def emi(
     raise typer.Exit(main(EmiSettings.load(config, flags)))
 
 
-def run_simulator(kind: str, ident: str, flags: dict[str, Any], config: Path | None, work: Any) -> None:
-    """Be a simulated sensor: ``work(runtime)`` until told to stop."""
+def world_time_ns(start_ns: int | None, every_s: float | None) -> tuple[int, int | None]:
+    """When the scenario began and, if it does, when it ends."""
+    now_ns = time.time_ns()
+    if every_s is None:
+        return (now_ns if start_ns is None else start_ns), None
+    if start_ns is not None:
+        raise typer.BadParameter("Give --start-ns or --start-every.")
+    every_ns = round(every_s * 1e9)
+    begin_ns = now_ns - now_ns % every_ns
+    return begin_ns, begin_ns + every_ns
+
+
+def run_simulator(
+    kind: str, ident: str, flags: dict[str, Any], config: Path | None, work: Any, end_ns: int | None = None
+) -> None:
+    """Be a simulated sensor: ``work(runtime)`` until told to stop, or until ``end_ns``."""
     settings = ServiceSettings.load(config, flags | {"unit_id": ident})
 
+    def end(runtime: ServiceRuntime) -> None:
+        from trackmesh.sim.live import wait_until
+
+        if end_ns is not None and wait_until(end_ns, runtime.stopping):
+            runtime.stop("the scenario has ended")
+
     def start(runtime: ServiceRuntime) -> None:
+        runtime.spawn("end", lambda: end(runtime))
+
         def loop() -> None:
             work(runtime)
             runtime.stop("the simulation has ended")
@@ -165,6 +197,7 @@ def sim_radar(
     ] = None,
     seed: Seed = 1,
     start_ns: StartNs = None,
+    start_every: StartEvery = None,
     config: Config = None,
     connect: Connect = None,
     realm: Realm = None,
@@ -178,7 +211,7 @@ def sim_radar(
     world = load_scenario(scenario)
     world.seen_targets()
     radar_id = world.radar(radar).id if radar else world.radars[0].id
-    begin_ns = time.time_ns() if start_ns is None else start_ns
+    begin_ns, end_ns = world_time_ns(start_ns, start_every)
 
     def work(runtime: ServiceRuntime) -> None:
         run_radar(
@@ -186,7 +219,7 @@ def sim_radar(
         )
 
     flags = given(connect=connect, realm=realm, log_level=log_level, log_format=log_format)
-    run_simulator("sim-radar", radar_id, flags, config, work)
+    run_simulator("sim-radar", radar_id, flags, config, work, end_ns)
 
 
 @sim.command("truth")
@@ -195,6 +228,7 @@ def sim_truth(
     scenario: Scenario = "two-radars",
     seed: Seed = 1,
     start_ns: StartNs = None,
+    start_every: StartEvery = None,
     config: Config = None,
     connect: Connect = None,
     realm: Realm = None,
@@ -205,13 +239,13 @@ def sim_truth(
     from trackmesh.sim.live import run_truth
     from trackmesh.sim.scenario import load_scenario
 
-    world, begin_ns = load_scenario(scenario), time.time_ns() if start_ns is None else start_ns
+    world, (begin_ns, end_ns) = load_scenario(scenario), world_time_ns(start_ns, start_every)
 
     def work(runtime: ServiceRuntime) -> None:
         run_truth(runtime.bus, world, seed, begin_ns, runtime.stopping, keys=runtime.keys)
 
     flags = given(connect=connect, realm=realm, log_level=log_level, log_format=log_format)
-    run_simulator("sim-truth", world.name, flags, config, work)
+    run_simulator("sim-truth", world.name, flags, config, work, end_ns)
 
 
 @sim.command("record")

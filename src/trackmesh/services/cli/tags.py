@@ -30,7 +30,7 @@ from trackmesh.services.cli.options import (
     say,
     told,
 )
-from trackmesh.services.cli.services import StartNs, given, run_simulator, sim
+from trackmesh.services.cli.services import StartEvery, StartNs, given, run_simulator, sim, world_time_ns
 from trackmesh.services.runtime import ServiceRuntime
 
 if TYPE_CHECKING:
@@ -77,6 +77,7 @@ def sim_tags(
     scenario: Scenario = "rfid19",
     seed: Seed = 1,
     start_ns: StartNs = None,
+    start_every: StartEvery = None,
     announce: Annotated[
         bool, typer.Option("--announce/--silent", help="Whether the readers say where they stand.")
     ] = True,
@@ -90,7 +91,7 @@ def sim_tags(
     from trackmesh.sim.live import run_tags
     from trackmesh.sim.scenario import load_scenario
 
-    world, begin_ns = load_scenario(scenario), time.time_ns() if start_ns is None else start_ns
+    world, (begin_ns, end_ns) = load_scenario(scenario), world_time_ns(start_ns, start_every)
     network_id = world.heard_tags().network_id
 
     def work(runtime: ServiceRuntime) -> None:
@@ -100,7 +101,7 @@ def sim_tags(
         )  # fmt: skip
 
     flags = given(connect=connect, realm=realm, log_level=log_level, log_format=log_format)
-    run_simulator("sim-tags", network_id, flags, config, work)
+    run_simulator("sim-tags", network_id, flags, config, work, end_ns)
 
 
 @sim.command("ranges")
