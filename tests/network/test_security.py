@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
-from tests.network.processes import Processes, free_port, wait_until
+from tests.network.processes import Processes, RouterProcess, free_port, wait_until
 from tests.network.secured import KEYS, Deployment, arrives, waiting
 
 from trackmesh.protocol.credentials import Credentials
@@ -71,7 +71,7 @@ def test_who_is_not_let_in_reads_why(processes: Processes, tmp_path: Path) -> No
         assert reason in str(error.value)
 
 
-def test_a_link_ends_with_the_certificate(processes: Processes, tmp_path: Path) -> None:
+def test_a_link_ends_with_the_certificate_and_comes_again_with_the_next(processes: Processes, tmp_path: Path) -> None:
     made = Deployment(plan(), tmp_path)
     made.router(processes)
     issue(tmp_path, Participant("sensor", "north"), days=6.0 / 86_400, renew=True)
@@ -79,6 +79,8 @@ def test_a_link_ends_with_the_certificate(processes: Processes, tmp_path: Path) 
         sensor.declare_alive(KEYS.live("sensor", "north"))
         wait_until(lambda: viewer.alive(KEYS.live("*", "*")), "the sensor is there")
         wait_until(lambda: not viewer.alive(KEYS.live("*", "*")), "the sensor is put out")
+        issue(tmp_path, Participant("sensor", "north"), renew=True)
+        wait_until(lambda: viewer.alive(KEYS.live("*", "*")), "the sensor is there again, without a new start")
 
 
 def test_while_authorities_change_both_are_trusted(processes: Processes, tmp_path: Path) -> None:
@@ -122,6 +124,24 @@ def test_a_router_passes_on_no_more_than_its_rate(processes: Processes, tmp_path
             flood.put(b"x", "")
         assert arrives(north, ear, KEYS.status("sim-radar", "north"), KEYS.sensor("north")) > 0
         assert waiting(heard) <= 10.0 * (time.monotonic() - began_s) + 1
+
+
+def test_a_router_has_no_more_links_than_its_limit(processes: Processes, tmp_path: Path) -> None:
+    made = Deployment(plan(limits=Limits(links=2)), tmp_path)
+    made.router(processes)
+    with made.bus("archive.disk"):
+        with made.bus("sensor.north"), pytest.raises(BusError):
+            ZenohBus.open([made.endpoint()], credentials=made.credentials("viewer.ops"), timeout_s=0.5)
+        made.bus("viewer.ops").close()
+
+
+def test_how_a_router_is_run_is_nobodys_business(processes: Processes, router: RouterProcess, tmp_path: Path) -> None:
+    made = Deployment(plan(), tmp_path)
+    made.router(processes)
+    with ZenohBus.open([router.endpoint]) as bus:
+        assert list(bus.query("@/*/router"))
+    with made.bus("archive.disk") as bus:
+        assert list(bus.query("@/*/router")) == []
 
 
 def test_names_and_passwords(processes: Processes, tmp_path: Path) -> None:
