@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ def parsed(arguments: Sequence[str]) -> tuple[str, dict[str, Any]]:
     Raises:
         click.UsageError: it does not.
     """
-    command: Any = typer.main.get_command(app)
+    command = _program()
     context = click.Context(command, info_name="trackmesh")
     names: list[str] = []
     rest = list(arguments)
@@ -40,6 +41,11 @@ def parsed(arguments: Sequence[str]) -> tuple[str, dict[str, Any]]:
         command, names = found, [*names, name]
         context = command.make_context(name, list(rest), parent=context) if not hasattr(found, "commands") else context
     return " ".join(names), context.params
+
+
+@functools.cache
+def _program() -> Any:
+    return typer.main.get_command(app)
 
 
 def who_runs(arguments: Sequence[str]) -> Participant:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import pytest
@@ -160,3 +161,14 @@ def test_every_role_has_rights_and_what_it_hears_does_not_depend_on_its_name() -
 def test_with_passwords_users_are_named() -> None:
     control: Any = access_control(PLAN.model_copy(update={"security": "passwords"}))
     assert {"id": "sensor.north", "usernames": ["sensor.north"]} in control["subjects"]
+
+
+def test_every_family_of_keys_is_somebodys() -> None:
+    """Whoever adds a family says in ``rights.py`` whose it is; else secured deployments would be silent there."""
+    methods = [name for name in vars(Keys) if not name.startswith("_") and name not in {"realm", "everything"}]
+    arity = {name: len(inspect.signature(getattr(KEYS, name)).parameters) for name in methods}
+    families = {getattr(KEYS, name)(*["x"] * count).split("/")[2] for name, count in arity.items()}
+    every = [rights(KEYS, ["x"]) for role, rights in RIGHTS.items() if role != "router"]
+    owned = {key.split("/")[2] for one in every for key in (*one.says, *one.lives, *one.answers)}
+    # The truth is for scoring simulations; there is none where it would have to be secured.
+    assert families - owned == {"truth"}
