@@ -106,6 +106,13 @@ def test_it_is_not_root_and_cannot_change_itself(container: Container) -> None:
     assert container.run("trackmesh", "--version").startswith("trackmesh ")
 
 
+def test_it_says_how_it_is_run(container: Container) -> None:
+    config = json.loads(_buildah("inspect", "--type", "image", str(IMAGE)))["Docker"]["config"]
+    assert config["User"] == "10001:10001"
+    assert config["Entrypoint"] == ["trackmesh"]
+    assert config["Healthcheck"]["Test"] == ["CMD", "python3", "-m", "trackmesh.services.heartbeat"]
+
+
 def test_there_are_no_leftovers_of_the_build(container: Container) -> None:
     assert container.tells("test", "-e", "/build") == 1
     assert container.tells("test", "-e", "/opt/trackmesh/bin/gcc") == 1
