@@ -10,6 +10,7 @@ import pytest
 from tests.network.processes import Processes, RouterProcess, free_port, wait_until
 from tests.network.secured import KEYS, Deployment, arrives, waiting
 
+from trackmesh.protocol.bus import Subscription
 from trackmesh.protocol.credentials import Credentials
 from trackmesh.protocol.errors import BusError
 from trackmesh.protocol.zenoh_bus import ZenohBus
@@ -99,6 +100,35 @@ def test_while_authorities_change_both_are_trusted(processes: Processes, tmp_pat
         pass
 
 
+def test_what_was_sent_before_or_during_an_outage_comes_afterwards(processes: Processes, tmp_path: Path) -> None:
+    """The library's caches need rights of their own; without them all works but this."""
+    made = Deployment(plan(), tmp_path)
+    router = made.router(processes)
+    with made.bus("sensor.north") as north, made.bus("archive.disk") as disk:
+        plots = north.publisher(KEYS.plots("north"), history=16)
+        for number in range(5):
+            plots.put(bytes([number]), "")
+        ear = disk.subscribe(KEYS.plots("*"), history=True)
+        assert received(ear, 5) == [0, 1, 2, 3, 4]
+        plots.put(bytes([5]), "")
+        assert received(ear, 1) == [5]
+        router.kill()
+        for number in range(6, 10):
+            plots.put(bytes([number]), "")
+        made.router(processes)
+        assert received(ear, 4) == [6, 7, 8, 9]
+
+
+def received(subscription: Subscription, count: int) -> list[int]:
+    """The first bytes of the next messages."""
+    found: list[int] = []
+    for _ in range(count):
+        sample = subscription.receive(15.0)
+        assert sample is not None, f"only {found}"
+        found.append(sample.payload[0])
+    return found
+
+
 def test_a_router_drops_what_is_too_large(processes: Processes, tmp_path: Path) -> None:
     made = Deployment(plan(limits=Limits(plots_bytes=2000)), tmp_path)
     made.router(processes)
@@ -180,6 +210,14 @@ def test_two_sites_are_one_realm(processes: Processes, tmp_path: Path) -> None:
     with made.bus("sensor.north", listen[0]) as north, made.bus("archive.disk", listen[1]) as ear:
         assert arrives(north, ear, KEYS.plots("north"), KEYS.sensor("north")) > 0
         assert arrives(north, ear, KEYS.plots("east"), KEYS.sensor("north")) == 0
+        plots = north.publisher(KEYS.plots("north"), history=16)
+        for number in range(5):
+            plots.put(bytes([number]), "")
+        assert received(ear.subscribe(KEYS.plots("*"), history=True), 5) == [0, 1, 2, 3, 4]
+        north.serve(KEYS.sensor("north"), lambda _: [(b"it is me", "")])
+        north.declare_alive(KEYS.live("sensor", "north"))
+        wait_until(lambda: ear.alive(KEYS.live("*", "*")), "the sensor is alive at the other site")
+        wait_until(lambda: list(ear.query(KEYS.sensor("*"))), "the sensor answers the other site")
     other.kill()
     with made.bus("sensor.east", listen[1]) as east, made.bus("archive.disk", listen[1]) as ear:
         assert arrives(east, ear, KEYS.plots("east"), KEYS.sensor("east")) > 0
