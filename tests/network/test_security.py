@@ -75,7 +75,7 @@ def test_who_is_not_let_in_reads_why(processes: Processes, tmp_path: Path) -> No
 def test_a_link_ends_with_the_certificate_and_comes_again_with_the_next(processes: Processes, tmp_path: Path) -> None:
     made = Deployment(plan(), tmp_path)
     made.router(processes)
-    issue(tmp_path, Participant("sensor", "north"), days=6.0 / 86_400, renew=True)
+    issue(tmp_path, Participant("sensor", "north"), days=5.0 / 86_400, renew=True)
     with made.bus("viewer.ops") as viewer, made.bus("sensor.north") as sensor:
         sensor.declare_alive(KEYS.live("sensor", "north"))
         wait_until(lambda: viewer.alive(KEYS.live("*", "*")), "the sensor is there")
