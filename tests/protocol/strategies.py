@@ -346,6 +346,9 @@ healths = st.builds(
     last_seq=maybe(counts),
     last_t_ns=maybe(times_ns),
     clutter_density=maybe(real(0)),
+    silent_since_ns=maybe(times_ns),
+    clock_offset_s=maybe(real()),
+    clock_drift_ppm=maybe(real()),
 )
 statuses = st.builds(
     ServiceStatus,
@@ -360,6 +363,8 @@ statuses = st.builds(
     latency_ms=st.dictionaries(texts, real(0), max_size=3),
     figures=st.dictionaries(texts, real(), max_size=3),
     sensors=st.lists(healths, max_size=2),
+    routers=st.lists(texts, max_size=2),
+    degraded=st.lists(texts, max_size=2),
 )
 
 

@@ -29,17 +29,17 @@ class Buffer(Generic[T]):
         with self._changed:
             if self._closed:
                 return
-            if len(self._items) >= self._capacity:
-                self._items.popleft()
+            if len(self) >= self._capacity:
+                self._drop(item)
                 self.dropped += 1
-            self._items.append(item)
+            self._append(item)
             self._changed.notify()
 
     def receive(self, timeout_s: float | None = None) -> T | None:
         """The oldest item, or None after ``timeout_s`` or when closed and empty."""
         with self._changed:
-            self._changed.wait_for(lambda: self._items or self._closed, timeout_s)
-            return self._items.popleft() if self._items else None
+            self._changed.wait_for(lambda: len(self) or self._closed, timeout_s)
+            return self._take() if len(self) else None
 
     def on_close(self, action: Callable[[], None]) -> None:
         """Have ``action`` called at the first ``close``."""
@@ -53,6 +53,22 @@ class Buffer(Generic[T]):
             action, self._on_close = self._on_close, None
         if action is not None:
             action()
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __bool__(self) -> bool:
+        return True
+
+    def _append(self, item: T) -> None:
+        self._items.append(item)
+
+    def _take(self) -> T:
+        return self._items.popleft()
+
+    def _drop(self, item: T) -> None:
+        """Make room for an item."""
+        self._items.popleft()
 
     def __iter__(self) -> Iterator[T]:
         while (item := self.receive()) is not None:

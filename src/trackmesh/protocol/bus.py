@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple, Protocol, Self
 
+from trackmesh.protocol.links import Links
+
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 """Where a router is looked for, and listens, unless told otherwise."""
 
@@ -90,7 +92,13 @@ class AliveSubscription(Closeable, Protocol):
 
 
 class Bus(Protocol):
-    """What every part of trackmesh needs of a network."""
+    """What every part of trackmesh needs of a network.
+
+    Attributes:
+        links: to the routers, as they come and go.
+    """
+
+    links: Links
 
     def publisher(self, key: str, *, history: int = 0) -> Publisher:
         """Declare a publisher.
@@ -101,8 +109,18 @@ class Bus(Protocol):
                 gone with the publisher.
         """
 
-    def subscribe(self, expression: str, *, history: bool = False, capacity: int = 256) -> Subscription:
-        """Subscribe to a key expression; with ``history`` also to what publishers kept, gaps filled in order."""
+    def subscribe(
+        self, expression: str, *, history: bool = False, capacity: int = 256, fair: bool = False
+    ) -> Subscription:
+        """Subscribe to a key expression.
+
+        Args:
+            expression: of the keys.
+            history: also what publishers kept, gaps filled in order.
+            capacity: how many messages wait, at most.
+            fair: keys take turns where several wait, and a full buffer drops messages of a key that holds more than its
+                share: a key that floods cannot displace the others. The order of each key's messages is kept.
+        """
 
     def query(
         self,

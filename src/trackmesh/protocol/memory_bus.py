@@ -10,12 +10,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Self, TypeVar
+from typing import NamedTuple, Self, TypeVar
 
 from trackmesh.protocol.buffer import Buffer
 from trackmesh.protocol.bus import WAITING, AliveEvent, Query, QueryHandler, Sample
 from trackmesh.protocol.errors import BusError
+from trackmesh.protocol.fair_buffer import FairBuffer
 from trackmesh.protocol.keys import matches, parse_parameters
+from trackmesh.protocol.links import Links
 from trackmesh.protocol.serving import Job, QueryPool
 
 D = TypeVar("D", bound="_Declared")
@@ -37,6 +39,11 @@ class MemoryHub:
         """Keys of the tokens that meet an expression, sorted."""
         with self.lock:
             return sorted({token.key for token in self.tokens if matches(expression, token.key)})
+
+    def forget(self, subscription: _Subscription) -> None:
+        """Deliver to it no longer."""
+        with self.lock:
+            self.subscriptions.remove(subscription)
 
     def announce(self, event: AliveEvent) -> None:
         """Tell watchers."""
@@ -65,16 +72,9 @@ class _Declared:
         self._leave()
 
 
-class _Subscription(Buffer[Sample]):
-    def __init__(self, hub: MemoryHub, expression: str, capacity: int) -> None:
-        super().__init__(capacity)
-        self.on_close(self._leave)
-        self.expression = expression
-        self._hub = hub
-
-    def _leave(self) -> None:
-        with self._hub.lock:
-            self._hub.subscriptions.remove(self)
+class _Subscription(NamedTuple):
+    expression: str
+    buffer: Buffer[Sample]
 
 
 class _Watcher(Buffer[AliveEvent]):
@@ -103,7 +103,7 @@ class _MemoryPublisher(_Declared):
             self.kept.append(sample)
             for subscription in self.hub.subscriptions:
                 if matches(subscription.expression, self.key):
-                    subscription.offer(sample)
+                    subscription.buffer.offer(sample)
 
 
 class _Server(_Declared):
@@ -136,6 +136,7 @@ class MemoryBus:
 
     def __init__(self, hub: MemoryHub | None = None) -> None:
         self.hub = hub or MemoryHub()
+        self.links = Links()
         self._closing: list[Callable[[], None]] = []
         self._closed = False
 
@@ -143,17 +144,21 @@ class MemoryBus:
         """See ``Bus.publisher``."""
         return self._mine(_MemoryPublisher(self._open_hub(), key, history))
 
-    def subscribe(self, expression: str, *, history: bool = False, capacity: int = 256) -> Buffer[Sample]:
+    def subscribe(
+        self, expression: str, *, history: bool = False, capacity: int = 256, fair: bool = False
+    ) -> Buffer[Sample]:
         """See ``Bus.subscribe``."""
         hub = self._open_hub()
-        subscription = _Subscription(hub, expression, capacity)
+        buffer = FairBuffer(capacity) if fair else Buffer[Sample](capacity)
+        subscription = _Subscription(expression, buffer)
+        buffer.on_close(lambda: hub.forget(subscription))
         with hub.lock:
             for publisher in hub.publishers if history else ():
                 for sample in publisher.kept if matches(expression, publisher.key) else ():
-                    subscription.offer(sample)
+                    buffer.offer(sample)
             hub.subscriptions.append(subscription)
-        self._closing.append(subscription.close)
-        return subscription
+        self._closing.append(buffer.close)
+        return buffer
 
     def query(
         self,

@@ -25,7 +25,9 @@ from trackmesh.protocol.buffer import Buffer
 from trackmesh.protocol.bus import WAITING, AliveEvent, Query, QueryHandler, Sample
 from trackmesh.protocol.credentials import Credentials
 from trackmesh.protocol.errors import BusError
+from trackmesh.protocol.fair_buffer import FairBuffer
 from trackmesh.protocol.keys import parse_parameters
+from trackmesh.protocol.links import Links
 from trackmesh.protocol.refused import why_refused
 from trackmesh.protocol.serving import Job, QueryPool
 from trackmesh.protocol.zenoh_config import client_config, credentials_of, endpoints_of
@@ -179,7 +181,11 @@ class ZenohBus:
         self._lock = threading.Lock()
         self._declared: dict[_Declaration, None] = {}
         self._closed = False
+        self.links = Links(_log.warning)
         _guard.add(self)
+        self._declare(
+            lambda session: _Declaration(session.info.declare_link_events_listener(self._on_link, history=True))
+        )
 
     @classmethod
     def open(
@@ -222,9 +228,11 @@ class ZenohBus:
         """See ``Bus.publisher``."""
         return self._declare(lambda session: _ZenohPublisher(declare_publisher(session, key, history)))
 
-    def subscribe(self, expression: str, *, history: bool = False, capacity: int = 256) -> Buffer[Sample]:
+    def subscribe(
+        self, expression: str, *, history: bool = False, capacity: int = 256, fair: bool = False
+    ) -> Buffer[Sample]:
         """See ``Bus.subscribe``."""
-        buffer: Buffer[Sample] = Buffer(capacity)
+        buffer = FairBuffer(capacity) if fair else Buffer[Sample](capacity)
         callback = _offer_to(buffer)
         return self._declare(
             lambda session: _Subscription(declare_subscriber(session, expression, history, callback), buffer)
@@ -302,6 +310,10 @@ class ZenohBus:
 
     def __exit__(self, *exc: object) -> None:
         self.close()
+
+    def _on_link(self, event: zenoh.LinkEvent) -> None:
+        note = self.links.came if event.kind == zenoh.SampleKind.PUT else self.links.went
+        note(str(event.link.dst))
 
     def _declare(self, make: Callable[[zenoh.Session], D]) -> D:
         if self._closed:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,10 +15,32 @@ from trackmesh.protocol.messages import SensorHealth
 
 @dataclass(frozen=True)
 class Health:
-    """What a service adds to its status: present values by name, and its sensors."""
+    """What a service adds to its status: present values by name, its sensors, and what is missing or wrong now.
+
+    ``notices`` are sentences by a name that stays while it lasts.
+    """
 
     figures: dict[str, float] = field(default_factory=dict)
     sensors: list[SensorHealth] = field(default_factory=list)
+    notices: dict[str, str] = field(default_factory=dict)
+
+
+class Notices:
+    """Tells each thing that is wrong once when it begins and once when it ends."""
+
+    def __init__(self, begins: Callable[[str], None], ends: Callable[[str], None]) -> None:
+        self._begins = begins
+        self._ends = ends
+        self._last: dict[str, str] = {}
+
+    def update(self, now: Mapping[str, str]) -> list[str]:
+        """The sentences of now, having told what is new and what is over."""
+        for key in self._last.keys() - now.keys():
+            self._ends(f"over: {self._last[key]}")
+        for key in now.keys() - self._last.keys():
+            self._begins(now[key])
+        self._last = dict(now)
+        return list(now.values())
 
 
 class Counters:

@@ -33,7 +33,7 @@ from trackmesh.protocol.codec import encode, encoding
 from trackmesh.protocol.errors import TrackmeshError
 from trackmesh.protocol.keys import Keys
 from trackmesh.protocol.messages import ServiceStatus
-from trackmesh.services.health import Counters, Health, Latencies
+from trackmesh.services.health import Counters, Health, Latencies, Notices
 from trackmesh.services.heartbeat import beat
 from trackmesh.services.logs import configure_logging
 from trackmesh.services.process import EXIT_DEADLINE, EXIT_FAILED, EXIT_OK, on_signal
@@ -83,6 +83,7 @@ class ServiceRuntime:
         self.stopping = threading.Event()
         self.log = logging.getLogger(f"trackmesh.{kind}")
         self.health: Callable[[], Health] = Health
+        self._notices = Notices(lambda said: self.log.warning("%s", said), lambda said: self.log.info("%s", said))
         self._bus = bus
         self._owns_bus = bus is None
         self._state: State = "starting"
@@ -292,6 +293,11 @@ class ServiceRuntime:
             self.log.exception("the health of the service could not be told")
             self.counters.count("health_errors")
             health = Health()
+        links = self.bus.links
+        link = links.notice()
+        # Without a link nothing is heard of anybody: that is one thing that is wrong, not many.
+        wrong = {} if not links.up and link else health.notices
+        figures = health.figures | links.figures()
         return ServiceStatus(
             kind=self.kind,
             unit_id=self.settings.unit_id,
@@ -303,6 +309,8 @@ class ServiceRuntime:
             counters=self.counters.counts(),
             refused=self.counters.refused(),
             latency_ms=self.latencies.percentiles_ms(),
-            figures={name: float(value) for name, value in health.figures.items() if math.isfinite(value)},
+            figures={name: float(value) for name, value in figures.items() if math.isfinite(value)},
             sensors=health.sensors,
+            routers=links.up,
+            degraded=self._notices.update(({"link": link} if link else {}) | wrong),
         )

@@ -22,13 +22,17 @@ class SensorHealth(Message):
     last_seq: Seq | None = None
     last_t_ns: UnixNs | None = None
     clutter_density: NonNegative | None = None
+    silent_since_ns: UnixNs | None = None
+    clock_offset_s: Finite | None = None
+    clock_drift_ppm: Finite | None = None
 
 
 class ServiceStatus(TopMessage):
     """One service's health, once a second.
 
     ``counters`` count since start, ``refused`` counts refused input by reason, ``latency_ms`` holds percentiles
-    (``"p50"``, ``"p90"``, ``"p99"``) of the last minute, ``figures`` other present values by name.
+    (``"p50"``, ``"p90"``, ``"p99"``) of the last minute, ``figures`` other present values by name, ``degraded`` a
+    sentence for each thing that is missing or wrong now; it is empty when all is well.
     """
 
     most_bytes: ClassVar[int] = 4 * 2**20
@@ -45,3 +49,5 @@ class ServiceStatus(TopMessage):
     latency_ms: dict[str, NonNegative] = {}
     figures: dict[str, Finite] = {}
     sensors: Annotated[list[SensorHealth], Field(fail_fast=True)] = []
+    routers: list[str] = []
+    degraded: list[str] = []

@@ -13,11 +13,13 @@ import typer
 from pydantic import ValidationError
 from rich.console import Group
 from rich.live import Live
+from rich.text import Text
 
 from trackmesh.protocol.client import Watch
 from trackmesh.protocol.codec import refusal
 from trackmesh.protocol.files import RecordWriter, read_records, to_line
 from trackmesh.protocol.messages import TagFrame, TrackFrame, TrackQuery
+from trackmesh.services.cli.attention import Attention, routers_down
 from trackmesh.services.cli.options import (
     AsJson,
     Config,
@@ -26,13 +28,15 @@ from trackmesh.services.cli.options import (
     Unit,
     client,
     corners,
+    endpoints,
     instant_ns,
     out,
+    reach,
     say,
     told,
 )
 from trackmesh.services.cli.playback import play_records
-from trackmesh.services.cli.tables import sensor_table, status_table, tag_table, track_table
+from trackmesh.services.cli.tables import degraded_lines, sensor_table, status_table, tag_table, track_table
 from trackmesh.services.process import on_signal
 
 
@@ -69,8 +73,13 @@ def watch(
         if only_tags or not (as_json or out_path):
             watched.append(opened.enter_context(ask.watch_tags(unit)))
         live = opened.enter_context(Live(console=out, auto_refresh=False, transient=True))
-        seen = Seen()
+        statuses = opened.enter_context(ask.watch_statuses())
+        seen = Seen(Attention(ask.bus.links))
         while not stop.is_set() and time.monotonic() < deadline_s:
+            while (status := statuses.receive(timeout_s=0)) is not None:
+                seen.attention.take(status)
+            if out.is_terminal and not as_json:
+                live.update(seen.tables(max(5, out.height - 6)), refresh=True)
             for frames in watched:
                 frame = frames.receive(timeout_s=0.2 / len(watched))
                 if frame is None:
@@ -79,15 +88,15 @@ def watch(
                     writer.write(frame)
                 if as_json:
                     print(to_line(frame), flush=True)
-                elif out.is_terminal:
+                else:
                     seen.take(frame)
-                    live.update(seen.tables(max(5, out.height - 6)), refresh=True)
 
 
 class Seen:
-    """The last frames heard, for the eye."""
+    """The last frames heard, for the eye, and below them what is missing or wrong."""
 
-    def __init__(self) -> None:
+    def __init__(self, attention: Attention) -> None:
+        self.attention = attention
         self._tracks: TrackFrame | None = None
         self._tags: TagFrame | None = None
 
@@ -100,9 +109,11 @@ class Seen:
 
     def tables(self, most: int) -> Group:
         """Tracks and tags, as many rows as there is room for."""
+        wrong = [Text(line, style="yellow") for line in self.attention.lines()]
+        most = max(3, most - len(wrong))
         share = most if self._tracks is None or self._tags is None else most // 2 - 2
         tables = [] if self._tracks is None else [track_table([self._tracks], most=share)]
-        return Group(*tables, *([] if self._tags is None else [tag_table([self._tags], most=share)]))
+        return Group(*tables, *([] if self._tags is None else [tag_table([self._tags], most=share)]), *wrong)
 
 
 @told
@@ -166,14 +177,16 @@ def sensors(as_json: AsJson = False, config: Config = None, connect: Connect = N
 def status(as_json: AsJson = False, config: Config = None, connect: Connect = None, realm: Realm = None) -> None:
     """Show how every service is.
 
-    What it counted, what it refused and why, its latency, and the sensors it hears.
+    What it counted, what it refused and why, its latency, the sensors it hears, and what is missing or wrong.
     """
     with client(connect, realm, config) as ask:
         found = ask.statuses()
     if as_json:
         print(json.dumps([s.model_dump(mode="json") for s in found]))
-    else:
-        out.print(status_table(found))
+        return
+    out.print(status_table(found))
+    for line in routers_down(endpoints(connect, config), lambda one: reach(one, config)) + degraded_lines(found):
+        out.print(line, style="yellow", highlight=False, markup=False)
 
 
 @told

@@ -50,6 +50,9 @@ Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Everythin
 PATIENCE_S = 2.0
 """How long a command that only asks tries to find a router, unless a setting says otherwise."""
 
+PROBE_S = 0.3
+"""And how long one of several routers may take to answer."""
+
 _WIDE = 160
 _ROOM_TO_WRAP = None if sys.stdout.isatty() or "COLUMNS" in os.environ else _WIDE
 
@@ -105,6 +108,23 @@ def client(connect: str | None, realm: str | None, config: Path | None = None) -
         credentials=settings.credentials(),
     ) as bus:
         yield Client(bus, settings.realm)
+
+
+def endpoints(connect: str | None, config: Path | None = None) -> list[str]:
+    """Where the routers are, as far as flags, environment and file say."""
+    return ServiceSettings.load(config, {"connect": connect}).endpoints()
+
+
+def reach(endpoint: str, config: Path | None = None) -> None:
+    """Join through one router, and leave.
+
+    Raises:
+        TrackmeshError: it does not answer.
+    """
+    from trackmesh.protocol.zenoh_bus import ZenohBus
+
+    settings = ServiceSettings.load(config)
+    ZenohBus.open([endpoint], timeout_s=PROBE_S, config_path=settings.zenoh_config).close()
 
 
 def corners(text: str | None, option: str) -> list[float] | None:

@@ -13,6 +13,7 @@ from trackmesh.protocol.messages import (
     EmiResult,
     EmiTarget,
     SensorBias,
+    SensorHealth,
     SensorInfo,
     ServiceStatus,
     TagFrame,
@@ -182,14 +183,35 @@ def status_table(statuses: Iterable[ServiceStatus]) -> Table:
             f"{(now_ns - s.t_ns) / 1e9:.1f}",
         )
         for sensor in s.sensors:
-            life = "alive" if sensor.alive else "gone"
             is_unit = f"input_tracks.{sensor.sensor_id}" in s.figures
             plots, batches = ("tracks", "frames") if is_unit else ("plots", "batches")
             counted = (
                 f"{sensor.plots} {plots}, {sensor.batches} {batches}, {sensor.gaps} missing, {sensor.refused} refused"
             )
-            table.add_row(f"  {sensor.sensor_id}", "", life, "", "", counted, "", "", "")
+            late = (
+                ""
+                if sensor.last_t_ns is None or s.t_ns < sensor.last_t_ns
+                else f"{(s.t_ns - sensor.last_t_ns) / 1e9:.1f}"
+            )
+            table.add_row(f"  {sensor.sensor_id}", "", _life(sensor), "", "", counted, "", _clock(sensor), late)
     return table
+
+
+def _life(sensor: SensorHealth) -> str:
+    life = "alive" if sensor.alive else "gone"
+    return life if sensor.silent_since_ns is None else f"{life}, silent"
+
+
+def _clock(sensor: SensorHealth) -> str:
+    if sensor.clock_offset_s is None:
+        return ""
+    drift = "" if sensor.clock_drift_ppm is None else f", {sensor.clock_drift_ppm:+.0f} ppm"
+    return f"clock {sensor.clock_offset_s:+.2f} s{drift}"
+
+
+def degraded_lines(statuses: Iterable[ServiceStatus]) -> list[str]:
+    """What the services say is missing or wrong, a line each."""
+    return [f"{s.kind} {s.unit_id}: {sentence}" for s in statuses for sentence in s.degraded]
 
 
 def result_table(results: list[EmiResult]) -> Table:

@@ -21,9 +21,11 @@ from trackmesh.services.fusion.input_feed import InputFeed
 from trackmesh.services.fusion.intake import Intake
 from trackmesh.services.fusion.keeping import Keeper
 from trackmesh.services.fusion.picture import TRACK_EPOCH_MS
+from trackmesh.services.fusion.rates import Rates
 from trackmesh.services.fusion.settings import FusionSettings
 from trackmesh.services.fusion.warm_up import warm_up
 from trackmesh.services.runtime import Health, ServiceRuntime
+from trackmesh.services.sensor_watch import Limits, SensorWatch
 
 KIND = "fusion"
 # After an outage the plots of all of it come at once, and so do the frames; not every client is back by then.
@@ -45,6 +47,10 @@ class FusionService:
         self.unit = Unit(settings.unit_id, settings.unit_number, runtime.boot_id, first)
         self.engine = self._new_engine()
         self.intake = Intake(int(settings.max_age_s * 1e9), int(settings.max_ahead_s * 1e9))
+        self._of_now = settings.clock == "wall"
+        self._rates = Rates(settings.max_batches_per_s, settings.max_plots_per_s)
+        limits = Limits(settings.clock_limit_s, settings.clock_drift_limit_ppm)
+        self._watch = SensorWatch(limits, self._of_now, tuple(settings.sensors))
         self._lock = threading.Lock()
         self._alive: set[str] = set()
         self._held: dict[str, deque[PlotBatch]] = {}
@@ -83,7 +89,9 @@ class FusionService:
         runtime.on_exit(self._biases.close)
         self._tokens = runtime.closing(runtime.bus.watch_alive(keys.live("*", "*")))
         self._infos = runtime.closing(runtime.bus.subscribe(keys.sensor("*"), history=True))
-        self._plots = runtime.closing(runtime.bus.subscribe(keys.plots("*"), history=True, capacity=_PLOTS_WAITING))
+        plots = runtime.bus.subscribe(keys.plots("*"), history=True, capacity=_PLOTS_WAITING, fair=True)
+        self._plots = runtime.closing(plots)
+        self._watch.began_ns = time.time_ns()
         if self.settings.inputs:
             self._inputs = InputFeed(runtime, self.settings)
         runtime.health = self.health
@@ -110,11 +118,12 @@ class FusionService:
         with self._lock:
             figures = self.engine.figures()
             counters = dict(self.engine.counters)
+            notices = self._watch.notices(self._alive, time.time_ns())
             sensors = [self._sensor_health(sensor_id) for sensor_id in sorted(self.intake.streams)]
             sensors += self._inputs.health(self.engine.inputs) if self._inputs else []
         figures |= {f"engine.{name}": float(value) for name, value in counters.items()}
         figures["batches_dropped_here"] = float(self._plots.dropped)
-        return Health(figures, sensors)
+        return Health(figures, sensors, notices)
 
     # --- the engine's thread ---
 
@@ -164,6 +173,7 @@ class FusionService:
             self._record(info)
             with self._lock:
                 self.engine.sensor(info)
+                self._watch.expect(info.sensor_id, info.period_s, time.time_ns())
             self.runtime.log.info("sensor %s: %s, every %g s", info.sensor_id, info.kind, info.period_s)
         for batch in self._held.pop(info.sensor_id, ()):
             self._take_batch(batch)
@@ -172,20 +182,35 @@ class FusionService:
         sensor_id = last_chunk(sample.key)
         if not self._wanted(sensor_id):
             return
+        now_ns, now_s = time.time_ns(), time.monotonic()
         try:
+            # Before it is decoded: who floods must cost nothing.
+            if self._of_now and not self._rates.message(sensor_id, now_s):
+                raise RefusedMessage("too_fast", f"Sensor {sensor_id} sends more batches than it may.")
             batch = decode(sample.payload, PlotBatch, sample.encoding, self.settings.max_batch_bytes)
             if batch.sensor_id != sensor_id:
                 raise RefusedMessage("wrong_sensor", f"{sample.key} brought plots of {batch.sensor_id}.")
             self._check_room(sensor_id)
-            now_ns = time.time_ns() if self.settings.clock == "wall" else None
-            self.intake.check(batch, now_ns)
+            self._note_heard(batch, now_ns)
+            if self._of_now and not self._rates.plots(sensor_id, len(batch.t_ns), now_s):
+                raise RefusedMessage("too_fast", f"Sensor {sensor_id} sends more plots than it may.")
+            self.intake.check(batch, now_ns if self._of_now else None)
         except RefusedMessage as error:
             self._refuse(sensor_id, error)
             return
+        self._watch.took(sensor_id, now_ns)
         if sensor_id in self.engine.sensors:
             self._take_batch(batch)
         else:
             self._hold(batch)
+
+    def _note_heard(self, batch: PlotBatch, now_ns: int) -> None:
+        sectors = batch.scan.sectors if batch.scan is not None else 1
+        newest_ns = int(batch.t_ns.max()) if len(batch.t_ns) else None
+        with self._lock:
+            self._watch.heard(batch.sensor_id, newest_ns, sectors, now_ns)
+        if (sensor := self.engine.sensors.get(batch.sensor_id)) is not None:
+            self._rates.expect(batch.sensor_id, sectors / sensor.info.period_s)
 
     def _check_room(self, sensor_id: str) -> None:
         unknown = sensor_id not in self.engine.sensors and sensor_id not in self._held
@@ -204,7 +229,7 @@ class FusionService:
         self.runtime.counters.count("batches")
         self.runtime.counters.count("plots", len(batch.t_ns))
         self._publish(frame)
-        if frame is not None and len(batch.t_ns) and self.settings.clock == "wall":
+        if frame is not None and len(batch.t_ns) and self._of_now:
             self.runtime.latencies.record((time.time_ns() - int(batch.t_ns.max())) / 1e9)
 
     def _take_tracks(self, frame: TrackFrame) -> None:
@@ -222,7 +247,7 @@ class FusionService:
         return not self.settings.sensors or sensor_id in self.settings.sensors
 
     def _tick_if_due(self) -> None:
-        if self.settings.clock != "wall" or time.monotonic() < self._tick_due_s:
+        if not self._of_now or time.monotonic() < self._tick_due_s:
             return
         self._tick_due_s = time.monotonic() + self.settings.tick_s
         t_ns = time.time_ns()
@@ -287,12 +312,14 @@ class FusionService:
 
     def _refuse(self, sensor_id: str, error: RefusedMessage) -> None:
         self.runtime.counters.refuse(error.reason)
+        self._watch.refused(sensor_id, error.reason)
         if sensor_id in self.intake.streams or sensor_id in self.engine.sensors:
             self.intake.stream(sensor_id).refused += 1
         self.runtime.log.debug("refused: %s", error)
 
     def _sensor_health(self, sensor_id: str) -> SensorHealth:
         stream, sensor = self.intake.streams[sensor_id], self.engine.sensors.get(sensor_id)
+        clock = self._watch.clock(sensor_id)
         return SensorHealth(
             sensor_id=sensor_id,
             alive=sensor_id in self._alive,
@@ -304,6 +331,9 @@ class FusionService:
             last_seq=max(stream.seq, 0),
             last_t_ns=stream.last_t_ns,
             clutter_density=sensor.system_clutter.whole() if sensor else None,
+            silent_since_ns=self._watch.silent_since_ns(sensor_id, time.time_ns()),
+            clock_offset_s=clock.offset_s,
+            clock_drift_ppm=clock.drift_ppm,
         )
 
 

@@ -265,6 +265,12 @@ class FusionSettings(ServiceSettings):
     max_ahead_s: Positive = Field(2.0, description="wall clock: plots further in the future are refused")
     max_batch_bytes: Annotated[int, Field(ge=1024)] = Field(4 * 2**20, description="larger plot batches are refused")
     max_sensors: Annotated[int, Field(ge=1, le=4096)] = Field(128, description="more sensors are refused")
+    max_batches_per_s: NonNegative = Field(
+        0.0, description="wall clock: of a sensor, more are refused; 0: four times what it declares, at least 50"
+    )
+    max_plots_per_s: Positive = Field(10_000.0, description="wall clock: of a sensor, more are refused")
+    clock_limit_s: Positive = Field(0.25, description="a sensor's clock that is further off is told")
+    clock_drift_limit_ppm: Positive = Field(100.0, description="a sensor's clock that drifts faster is told")
     tick_s: Positive = Field(0.25, description="how often time advances without data")
     black_box: Path | None = Field(None, description="file that records the engine's inputs")
     state_file: Path | None = Field(
