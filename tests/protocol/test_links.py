@@ -20,7 +20,7 @@ class Scene:
 
 def test_nothing_is_told_of_a_link_that_holds_nor_where_there_are_none() -> None:
     scene = Scene()
-    assert scene.links.figures() == {} and scene.links.notice() == ""
+    assert scene.links.figures() == {} and scene.links.notice() == "" and scene.links.steady
     scene.links.came(A)
     scene.pass_s(5)
     assert (scene.links.up, scene.links.notice(), scene.said) == ([A], "", [])
@@ -34,9 +34,12 @@ def test_a_lost_link_is_told_while_it_lasts_and_a_minute_after() -> None:
     scene.pass_s(8)
     assert scene.links.notice() == f"There is no link to a router since 12:00:00 UTC: {A} was lost."
     assert scene.links.figures() == {"links_lost": 1.0, "cut_off_s": 8.0}
+    assert not scene.links.steady
     scene.links.came(A)
+    assert not scene.links.steady
     assert scene.links.notice() == f"There was no link to the router {A} for 8.0 s from 12:00:00 UTC."
     scene.pass_s(61)
+    assert scene.links.steady
     assert scene.links.notice() == ""
     assert scene.links.figures() == {"links_lost": 1.0, "cut_off_s": 8.0}
     assert scene.said == [f"the link to the router {A} is lost", f"joined through {A} again after 8.0 s"]

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 
+SETTLING_S = 3.0
 RECENT_S = 60.0
 """A loss is worth telling for this long after the link is back."""
 
@@ -56,6 +57,12 @@ class Links:
         """Locators of the routers that there is a link to, sorted."""
         with self._lock:
             return sorted(self._up)
+
+    @property
+    def steady(self) -> bool:
+        """Whether there was a link for some time: just after one is back, what it withheld is still on its way."""
+        with self._lock:
+            return bool(self._up or not self._lost) and self._clock() - self._back_ns > SETTLING_S * 1e9
 
     def figures(self) -> dict[str, float]:
         """Links lost since the start, and seconds without any; nothing where there never were links."""

@@ -296,7 +296,7 @@ class ServiceRuntime:
         links = self.bus.links
         link = links.notice()
         # Without a link nothing is heard of anybody: that is one thing that is wrong, not many.
-        wrong = {} if not links.up and link else health.notices
+        wrong = health.notices if links.steady else {}
         figures = health.figures | links.figures()
         return ServiceStatus(
             kind=self.kind,
