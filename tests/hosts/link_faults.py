@@ -20,10 +20,10 @@ from typing import NamedTuple, Self
 from tests.hosts.namespaces import Host, Network
 from tests.network.processes import Process, Processes, wait_until
 
-from trackmesh.protocol.bus import Subscription
+from trackmesh.protocol.bus import AliveSubscription, Subscription
 from trackmesh.protocol.zenoh_bus import ZenohBus
 
-KEPT = 2000
+KEPT = 750
 PATIENCE_S = 20.0
 PORT = 7447
 
@@ -34,7 +34,8 @@ class Outcome(NamedTuple):
     Attributes:
         published: numbers, of which ``lost`` never came and ``disordered`` came after a later one.
         withheld: published, but not come, when the link was healed.
-        again_s: from healing to the first message that was published after it.
+        joined_s: from healing to the moment at which the publisher was alive for the subscriber; 0 if it always was.
+        again_s: from healing to the first message that was published after it, which waits for all withheld ones.
         wedged: that, or those published later, did not come within 20 s.
     """
 
@@ -43,18 +44,21 @@ class Outcome(NamedTuple):
     withheld: int
     lost: int
     disordered: int
+    joined_s: float
     again_s: float
     wedged: bool
 
 
 class Listener:
-    """Takes numbers from a subscription in a thread, with the time at which each came."""
+    """Takes numbers from a subscription, with the time at which each came, and when their publisher joined."""
 
-    def __init__(self, subscription: Subscription) -> None:
+    def __init__(self, subscription: Subscription, tokens: AliveSubscription) -> None:
         self.came: list[tuple[int, float]] = []
-        self._subscription = subscription
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
+        self.alive_s: list[float] = []
+        self._subscription, self._tokens = subscription, tokens
+        self._threads = [threading.Thread(target=work) for work in (self._run, self._watch)]
+        for thread in self._threads:
+            thread.start()
 
     @property
     def last(self) -> int:
@@ -65,7 +69,14 @@ class Listener:
 
     def close(self) -> None:
         self._subscription.close()
-        self._thread.join()
+        self._tokens.close()
+        for thread in self._threads:
+            thread.join()
+
+    def _watch(self) -> None:
+        for event in self._tokens:
+            if event.alive:
+                self.alive_s.append(time.monotonic())
 
     def _run(self) -> None:
         for sample in self._subscription:
@@ -81,14 +92,22 @@ class Link:
         name: of this link among others.
         endpoint: at which the publisher finds the router.
         within: as a ``Host`` has it.
+        role: of the publisher: ``tick``, or ``pour``, which fills the socket while nothing passes.
     """
 
     def __init__(
-        self, processes: Processes, bus: ZenohBus, name: str, endpoint: str, within: Sequence[str] = ()
+        self,
+        processes: Processes,
+        bus: ZenohBus,
+        name: str,
+        endpoint: str,
+        within: Sequence[str] = (),
+        role: str = "tick",
     ) -> None:
         key = f"links/@v1/plots/{name}"
-        self.listener = Listener(bus.subscribe(key, history=True, capacity=100_000))
-        self.publisher = processes.start("-m", "tests.network.peers", "tick", endpoint, key, str(KEPT), within=within)
+        subscription = bus.subscribe(key, history=True, capacity=100_000)
+        self.listener = Listener(subscription, bus.watch_alive(f"{key}/alive"))
+        self.publisher = processes.start("-m", "tests.network.peers", role, endpoint, key, str(KEPT), within=within)
 
     def wait(self) -> None:
         """Wait until messages come."""
@@ -113,7 +132,9 @@ class Link:
         numbers = self.listener.numbers()
         lost = set(range(goal)) - set(numbers)
         disordered = sum(b <= a for a, b in itertools.pairwise(numbers))
-        return Outcome(case, goal, at - before, len(lost), disordered, round(first_s - healed_s, 3), wedged)
+        joined_s = next((at_s - healed_s for at_s in self.listener.alive_s if at_s > healed_s), 0.0)
+        took = round(joined_s, 3), round(first_s - healed_s, 3)
+        return Outcome(case, goal, at - before, len(lost), disordered, *took, wedged)
 
     def _comes(self, number: int, timeout_s: float) -> bool:
         deadline_s = time.monotonic() + timeout_s
@@ -139,8 +160,8 @@ class Scene:
 
     def link(self, name: str) -> tuple[Host, Link]:
         """Another host, and the link to it."""
-        host = self._network.host()
-        self._links.append(Link(self._processes, self._bus, name, self.endpoint, host.within))
+        host, role = self._network.host(), "pour" if "pour" in name else "tick"
+        self._links.append(Link(self._processes, self._bus, name, self.endpoint, host.within, role))
         return host, self._links[-1]
 
     def run(self, names: Sequence[str]) -> dict[str, Outcome]:
@@ -193,6 +214,8 @@ CASES = {
     "cut8": Case("link cut", Host.cut, 8.0),
     "drop4": Case("all packets dropped in silence", Host.drop, 4.0),
     "half4": Case("packets to the sensor dropped", lambda host: host.drop(outgoing=False), 4.0),
+    "pour4": Case("all packets of a large stream dropped", Host.drop, 4.0),
+    "pourcut4": Case("link of a large stream cut", Host.cut, 4.0),
     "loss": Case("5 % of packets lost", lambda host: host.lose(0.05), 8.0),
 }
 

@@ -1,8 +1,8 @@
 """Small participants, each a process of its own: ``python -m tests.network.peers ROLE ENDPOINTS KEY [N]``.
 
-``publish`` counts at up to 400 Hz, keeping N messages, and prints how far it is, ``tick`` at 50 Hz; ``token`` is alive;
-``listen`` subscribes in all ways and serves; ``forget`` does so and ends without closing anything; ``count`` answers a
-query with N numbers, and dies after half of them if asked to.
+``publish`` counts at up to 400 Hz, keeping N messages, and prints how far it is; ``tick`` does so at 50 Hz and is
+alive, ``pour`` with 32 kB each; ``token`` is only alive; ``listen`` subscribes in all ways and serves; ``forget`` does
+so and ends without closing anything; ``count`` answers a query with N numbers, and dies after half of them if told to.
 """
 
 from __future__ import annotations
@@ -18,17 +18,25 @@ from trackmesh.protocol.zenoh_bus import ZenohBus
 from trackmesh.services.process import on_signal
 
 
-def publish(bus: ZenohBus, key: str, history: int, stop: threading.Event, every_s: float = 0.0025) -> None:
+def publish(
+    bus: ZenohBus, key: str, history: int, stop: threading.Event, every_s: float = 0.0025, size: int = 0
+) -> None:
     publisher = bus.publisher(key, history=history)
     number = 0
     while not stop.wait(every_s):
-        publisher.put(str(number).encode(), "text/plain")
+        publisher.put(str(number).encode().ljust(size), "text/plain")
         print(f"at {number}", flush=True)
         number += 1
 
 
 def tick(bus: ZenohBus, key: str, history: int, stop: threading.Event) -> None:
+    bus.declare_alive(f"{key}/alive")
     publish(bus, key, history, stop, 0.02)
+
+
+def pour(bus: ZenohBus, key: str, history: int, stop: threading.Event) -> None:
+    bus.declare_alive(f"{key}/alive")
+    publish(bus, key, history, stop, 0.02, 32_000)
 
 
 def token(bus: ZenohBus, key: str, _n: int, stop: threading.Event) -> None:
@@ -62,6 +70,9 @@ def count(bus: ZenohBus, key: str, n: int, stop: threading.Event) -> None:
     stop.wait()
 
 
+ROLES = {"publish": publish, "tick": tick, "pour": pour, "token": token, "listen": listen, "count": count}
+
+
 def forget(endpoints: str, key: str, error: bool) -> None:
     bus = ZenohBus.open(endpoints.split(","))
     bus.subscribe(key)
@@ -78,7 +89,9 @@ def main(role: str, endpoints: str, key: str, n: int) -> None:
     stop = threading.Event()
     with on_signal(lambda _name: stop.set()), ZenohBus.open(endpoints.split(",")) as bus:
         print("ready", flush=True)
-        {"publish": publish, "tick": tick, "token": token, "listen": listen, "count": count}[role](bus, key, n, stop)
+        {"publish": publish, "tick": tick, "pour": pour, "token": token, "listen": listen, "count": count}[role](
+            bus, key, n, stop
+        )
     print("left", flush=True)
 
 

@@ -2,8 +2,10 @@
 
 The library fills gaps between samples of a publisher that it knows. Two of its means do not work with keys that have a
 verbatim chunk (``@v1``), and say nothing of it: it does not notice a publisher that comes later, nor understand
-heartbeats. So a subscriber here asks a publisher's cache itself when it first hears of it, by its token or by a sample,
-holds back what comes meanwhile, and delivers all in order; and a lost last sample is found by asking periodically.
+heartbeats. And it asks once for what is missing: if the link is only just back, and nobody answers yet, all of the
+outage is skipped. So a subscriber here asks a publisher's cache itself when it first hears of it, by its token or by a
+sample, and whenever a number is missing, until it has an answer; holds back what comes meanwhile, and delivers all in
+order; and a lost last sample is found by asking periodically.
 """
 
 from __future__ import annotations
@@ -20,8 +22,8 @@ from zenoh import ext, handlers
 
 RECOVERY_S = 0.5
 FETCH_TIMEOUT_S = 2.0
-RETRIES_S = (0.05, 0.15)
-"""Just after a link is back, a question finds nobody for some ten milliseconds."""
+RETRIES_S = (0.05, 0.15, 0.3, 0.5)
+"""Just after a link is back, a question finds nobody for some ten milliseconds, on a busy machine for longer."""
 
 HELD_MOST = 10_000
 SOURCES_MOST = 10_000
@@ -79,16 +81,25 @@ class _HistorySubscriber:
 
 @dataclass
 class _Stream:
-    """The samples of one publisher: ``held`` is not None while its cache is being asked."""
+    """The samples of one publisher.
 
+    Attributes:
+        cache: where its cache answers.
+        held: not None while its cache is being asked: what came meanwhile, and what the cache has answered.
+        last: the number delivered last.
+        answered: whether the cache has answered this question at all.
+        attempts: questions without an answer since the last one with any.
+    """
+
+    cache: str
     held: list[zenoh.Sample] | None = field(default_factory=list)
     last: int | None = None
-    found: bool = False
+    answered: bool = False
     attempts: int = 0
 
 
 class _Merge:
-    """Puts what a cache answers before what comes live."""
+    """Puts what a cache answers in the place of what did not come."""
 
     def __init__(self, session: zenoh.Session, deliver: Deliver) -> None:
         self._session = session
@@ -112,32 +123,41 @@ class _Merge:
         source = (str(info.source_id.zid), info.source_id.eid)
         stream = self._stream(source, f"{sample.key_expr}/@adv/pub/{source[0]}/{source[1]}/_")
         with self._lock:
-            if stream.held is None:
+            if stream.held is not None:
+                if len(stream.held) < HELD_MOST:
+                    stream.held.append(sample)
+                return
+            if stream.last is None or _after(_number(sample), stream.last) <= 1:
                 self._deliver_new(stream, sample)
-            elif len(stream.held) < HELD_MOST:
-                stream.held.append(sample)
+                return
+            stream.held, stream.attempts = [sample], 0
+        self._fetch(stream)
 
     def _stream(self, source: _Source, cache: str) -> _Stream:
         with self._lock:
             stream = self._streams.get(source)
             if stream is not None:
                 return stream
-            stream = self._streams[source] = _Stream()
+            stream = self._streams[source] = _Stream(cache)
             if len(self._streams) > SOURCES_MOST:
                 self._streams.popitem(last=False)
-        self._fetch(stream, cache)
+        self._fetch(stream)
         return stream
 
-    def _fetch(self, stream: _Stream, cache: str) -> None:
+    def _fetch(self, stream: _Stream) -> None:
         def on_reply(reply: zenoh.Reply) -> None:
-            if reply.ok is not None and stream.held is not None:
-                stream.found = True
-                stream.held.append(reply.ok)
+            with self._lock:
+                if reply.ok is not None and stream.held is not None:
+                    stream.answered = True
+                    stream.held.append(reply.ok)
 
+        stream.answered = False
+        # Numbers go round after 2^32; then all of the cache is asked for.
+        from_last = stream.last is not None and stream.last < 2**32 - HELD_MOST
         try:
             self._session.get(
-                cache,
-                handlers.Callback(on_reply, lambda: self._fetched(stream, cache)),
+                f"{stream.cache}?_sn={stream.last}.." if from_last else stream.cache,
+                handlers.Callback(on_reply, lambda: self._fetched(stream)),
                 consolidation=zenoh.ConsolidationMode.NONE,
                 accept_replies=zenoh.ReplyKeyExpr.ANY,
                 timeout=FETCH_TIMEOUT_S,
@@ -145,20 +165,41 @@ class _Merge:
         except zenoh.ZError:
             self._release(stream)
 
-    def _fetched(self, stream: _Stream, cache: str) -> None:
-        if stream.found or stream.attempts == len(RETRIES_S):
+    def _fetched(self, stream: _Stream) -> None:
+        if stream.answered:
+            stream.attempts = 0
+            if self._deliver_held(stream):
+                # What is missing still is asked for again as long as answers bring some of it.
+                self._fetch(stream)
+        elif stream.attempts == len(RETRIES_S):
             self._release(stream)
-            return
-        retry = threading.Timer(RETRIES_S[stream.attempts], self._fetch, (stream, cache))
-        stream.attempts += 1
-        retry.daemon = True
-        retry.start()
+        else:
+            retry = threading.Timer(RETRIES_S[stream.attempts], self._fetch, (stream,))
+            stream.attempts += 1
+            retry.daemon = True
+            retry.start()
+
+    def _deliver_held(self, stream: _Stream) -> bool:
+        """Deliver up to the first number that is missing; whether to ask for that, which may have come too late."""
+        with self._lock:
+            before, held = stream.last, self._sorted(stream)
+            for i, sample in enumerate(held):
+                if stream.last is not None and _after(_number(sample), stream.last) > 1 and before != stream.last:
+                    stream.held = held[i:]
+                    return True
+                self._deliver_new(stream, sample)
+            stream.held = None
+            return False
 
     def _release(self, stream: _Stream) -> None:
         with self._lock:
-            held, stream.held = stream.held or [], None
-            for sample in sorted(held, key=lambda sample: _after(_number(sample), _number(held[0]))):
+            for sample in self._sorted(stream):
                 self._deliver_new(stream, sample)
+            stream.held = None
+
+    def _sorted(self, stream: _Stream) -> list[zenoh.Sample]:
+        held = stream.held or []
+        return sorted(held, key=lambda sample: _after(_number(sample), _number(held[0])))
 
     def _deliver_new(self, stream: _Stream, sample: zenoh.Sample) -> None:
         number = _number(sample)
