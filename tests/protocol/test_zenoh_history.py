@@ -49,8 +49,7 @@ class FakeSession:
     def get(self, selector: str, handler: object, **_more: object) -> None:
         self.asked.append(selector.partition("?")[2])
         first = int(selector.partition("_sn=")[2].rstrip(".") or 0)
-        callback = cast(Any, handler).callback
-        done: Callable[[], None] = cast(Any, handler).drop
+        callback, done = cast(Any, handler).callback, cast(Any, handler).drop
         if self.deaf:
             self.deaf -= 1
         else:
@@ -65,10 +64,10 @@ class Timer:
     daemon = False
 
     def __init__(self, _delay_s: float, action: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-        self._run = lambda: action(*arguments)
+        self._action, self._arguments = action, arguments
 
     def start(self) -> None:
-        self._run()
+        self._action(*self._arguments)
 
 
 @pytest.fixture(autouse=True)
