@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 SECONDS_ ?= 60
+MINUTES ?= 20
 
-.PHONY: demo test check studies bench docker-check lock clean
+.PHONY: demo test check studies bench chaos soak flood docker-check lock clean
 
 demo: $(VENV)/ready
 	$(BIN)/trackmesh demo --seconds $(SECONDS_)
@@ -34,6 +35,16 @@ bench: $(VENV)/ready
 # The image, built and run without a Docker daemon: as root, with buildah; BASE=local where there is no registry.
 docker-check: $(VENV)/ready
 	docker/check
+
+# Ten minutes of a fault every five seconds; what grows in MINUTES; floods. Each leaves figures in out/.
+chaos: $(VENV)/ready
+	$(BIN)/python -m benchmarks.faults.chaos --out out/chaos
+
+soak: $(VENV)/ready
+	$(BIN)/python -m benchmarks.faults.soak --minutes $(MINUTES) --out out/soak
+
+flood: $(VENV)/ready
+	$(BIN)/python -m benchmarks.faults.flood --out out/flood
 
 $(VENV)/ready: pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "trackmesh needs Python 3.11 or newer")'

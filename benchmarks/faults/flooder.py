@@ -8,7 +8,9 @@ from __future__ import annotations
 import random
 import sys
 import time
+from typing import Any
 
+import msgpack
 import numpy as np
 
 from trackmesh.protocol.bus import Publisher
@@ -20,6 +22,10 @@ from trackmesh.protocol.zenoh_bus import ZenohBus
 
 SECTORS = 8
 PLOTS = 5
+ODD: list[Any] = [
+    None, True, -1, 0, 1.5, 2**63, -(2**63), float("nan"), float("inf"), "", "x" * 300, b"", bytes(999), [], {},
+    {"dtype": "<f8", "shape": [2**31, 2], "data": b""}, {"dtype": "O", "shape": [1], "data": b"1"}, [[]] * 50,
+]  # fmt: skip
 
 
 def batch(name: str, seq: int, rng: np.random.Generator) -> PlotBatch:
@@ -34,7 +40,9 @@ def batch(name: str, seq: int, rng: np.random.Generator) -> PlotBatch:
 
 
 def broken(data: bytes, rng: random.Random) -> bytes:
-    """Bytes flipped, cut, put in or doubled."""
+    """A message that was spoilt: in its bytes (flipped, cut, put in, doubled), or in one of its fields."""
+    if rng.random() < 0.6:
+        return _with_odd_field(data, rng)
     out = bytearray(data)
     for _ in range(rng.randint(1, 4)):
         i, act = rng.randrange(len(out) + 1), rng.randrange(4)
@@ -47,6 +55,22 @@ def broken(data: bytes, rng: random.Random) -> bytes:
         else:
             out[i:i] = out[: rng.randint(0, 40)]
     return bytes(out)
+
+
+def _with_odd_field(data: bytes, rng: random.Random) -> bytes:
+    fields: dict[str, Any] = msgpack.unpackb(data)
+    place, name = fields, rng.choice(list(fields))
+    if isinstance(fields[name], dict) and rng.random() < 0.7:
+        place = fields[name]
+        name = rng.choice(list(place))
+    act = rng.randrange(4)
+    if act == 0:
+        del place[name]
+    elif act == 1:
+        place[rng.choice(["seq", "more", "", "values"])] = place.pop(name)
+    else:
+        place[name] = rng.choice(ODD)
+    return bytes(msgpack.packb(fields))
 
 
 def flood(publisher: Publisher, name: str, rate_hz: float, seconds: float, garbage: bool) -> int:
