@@ -91,7 +91,7 @@ def test_a_drift_is_told_in_seconds_an_hour() -> None:
         now_ns = AT + k * S // 8
         one.heard("a", now_ns + round(500e-6 * k / 8 * S), 8, now_ns)
         one.took("a", now_ns)
-    assert "The clock of sensor a gains 500 ± 0 ppm (1.80 s an hour)." in one.notices({"a"}, now_ns).values()
+    assert "The clock of sensor a gains 500 ± 8 ppm (1.80 s an hour)." in one.notices({"a"}, now_ns).values()
 
 
 def test_each_notice_is_told_once_and_its_end_once() -> None:

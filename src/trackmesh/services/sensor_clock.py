@@ -21,10 +21,12 @@ ONE_OF = 8
 """Of so many batches in a block one may have a wild time stamp."""
 OFFSET_BLOCKS = 3
 OFFSET_BATCHES = 5
-DRIFT_BLOCKS = 6
+DRIFT_BLOCKS = 12
+LEAST_SCATTER_S = 0.002
 STEP_BLOCKS = 4
 STEP_S = 0.05
 STEP_SIGMAS = 8.0
+CLIPPED = 3.0
 _MAD = 1.4826
 
 
@@ -100,7 +102,7 @@ class SensorClock:
         if len(self._blocks) < DRIFT_BLOCKS:
             return None, 0.0
         t_s, _ = self._arrays()
-        sigma = self._scatter_s / float(np.sqrt(np.square(t_s - t_s.mean()).sum()))
+        sigma = max(self._scatter_s, LEAST_SCATTER_S) / float(np.sqrt(np.square(t_s - t_s.mean()).sum()))
         return -self._slope * 1e6, sigma * 1e6
 
     def _end_block(self) -> None:
@@ -143,4 +145,7 @@ def _line(t_s: FloatArray, low_s: FloatArray) -> tuple[float, float]:
     i, j = np.triu_indices(len(t_s), 1)
     slope = float(np.median((low_s[j] - low_s[i]) / (t_s[j] - t_s[i])))
     rest = low_s - slope * t_s
-    return slope, _MAD * float(np.median(np.abs(rest - np.median(rest))))
+    rest = np.abs(rest - np.median(rest))
+    usual_s = _MAD * float(np.median(rest))
+    # Of few points the median tells too little; wild ones must not tell too much.
+    return slope, max(usual_s, float(np.sqrt(np.square(np.minimum(rest, CLIPPED * usual_s)).mean())))

@@ -14,7 +14,7 @@ SILENT_S = 3.0
 TOLD_S = 3600.0
 """For so long a silent sensor is missed; then it is taken to be gone for good."""
 BLOCK_PERIODS = 2.5
-DRIFT_SIGMAS = 4.0
+DRIFT_SIGMAS = 5.0
 _NEVER = ClockEstimate(None, None, 0.0, 0)
 
 
