@@ -139,6 +139,23 @@ def test_a_slow_reader_loses_the_oldest_and_counts_them(network: Network) -> Non
     assert payloads(subscription, 8) == [str(i).encode() for i in range(42, 50)]
 
 
+def test_a_key_that_floods_displaces_no_other_where_that_is_asked_for(network: Network) -> None:
+    loud, quiet = (network.bus().publisher(network.key("plots", name)) for name in ("loud", "quiet"))
+    subscription = network.bus().subscribe(network.key("plots", "*"), capacity=8, fair=True)
+    join(loud, subscription)
+    join(quiet, subscription)
+    for i in range(50):
+        loud.put(str(i).encode(), "")
+    wait_until(lambda: subscription.dropped == 42, "the flood has come")
+    for i in range(3):
+        quiet.put(str(i).encode(), "")
+    wait_until(lambda: subscription.dropped == 45, "the others have come")
+    got = [subscription.receive(1.0) for _ in range(8)]
+    assert [s.payload for s in got if s and s.key.endswith("quiet")] == [b"0", b"1", b"2"]
+    assert [s.payload for s in got if s and s.key.endswith("loud")] == [b"45", b"46", b"47", b"48", b"49"]
+    assert got[1] is not None and got[1].key.endswith("quiet")
+
+
 def test_closing_a_subscription_ends_its_iteration(network: Network) -> None:
     subscription = network.bus().subscribe(network.key("plots", "*"))
     ended = threading.Event()
