@@ -24,6 +24,7 @@ from tests.hosts.proxy import Proxy
 from benchmarks.faults.chaos_chart import draw
 from benchmarks.faults.deployment import Deployment, Usage, free_port, trackmesh, wait_ready
 from benchmarks.faults.judge import Fault, Judge, account, read_black_box, read_journal, tracked
+from trackmesh.protocol.arrays import FloatArray
 from trackmesh.protocol.client import Client
 from trackmesh.protocol.messages import ServiceStatus, TrackFrame
 from trackmesh.protocol.zenoh_bus import ZenohBus
@@ -221,6 +222,7 @@ class Chaos:
         counted = account(published, taken, sum(self.gaps.values()))
         judged = self.judge.judged
         recovered = np.array([s for one in judged for s in one.recovered_s.values()])
+        undisturbed = np.array([s for one in judged for s in one.undisturbed_s.values()])
         worst = sorted(((max(one.recovered_s.values(), default=0.0), one) for one in judged), key=lambda w: -w[0])
         kept = [k for one in judged for k in one.kept.values()]
         never = [(f"{one.fault.kind} {one.fault.part}", len(one.missing)) for one in judged if one.missing]
@@ -230,16 +232,14 @@ class Chaos:
             "seed": self.seed,
             "faults": len(judged),
             "faults_by_kind": dict(Counter(f"{one.fault.kind} {one.fault.part}" for one in judged)),
-            "recovered_s": {
-                "p50": float(np.percentile(recovered, 50)), "p95": float(np.percentile(recovered, 95)),
-                "p99": float(np.percentile(recovered, 99)), "max": float(recovered.max()),
-            },
+            "recovered_s": _spread(recovered),
+            "recovered_of_last_healing_s": _spread(undisturbed),
             "worst": [
                 {"fault": " ".join(one.fault[:2]), "at_s": round(self._at_s(one.fault), 1), "s": round(s, 2)}
                 for s, one in worst[:8]
             ],
             "targets_judged": len(recovered),
-            "recovered_late": int((recovered > BOUND_S).sum()),
+            "recovered_late": int((undisturbed > BOUND_S).sum()),
             "never_recovered": never,
             "identities_kept": float(np.mean(kept)),
             "whole_picture": self.judge.whole_ns / max(1, self.judge.seen_ns),
@@ -254,7 +254,7 @@ class Chaos:
             "memory_growth": growth,
         }  # fmt: skip
         missed = {
-            "a target was tracked again too late": bool((recovered > BOUND_S).any() or never),
+            "a target was tracked again too late": bool((undisturbed > BOUND_S).any() or never),
             "numbers were lost": float(np.mean(kept)) < KEPT,
             "a batch went missing unseen": counted.untold > 0 or counted.twice > 0,
             "a process hung": bool(self.bad_ends),
@@ -275,6 +275,10 @@ class Chaos:
         early = [h.usage.rss_mib for h in like if h.at_s < self.seconds / 3]
         late = [h.usage.rss_mib for h in like if h.at_s > self.seconds * 2 / 3]
         return float(np.median(late) / np.median(early) - 1.0) if len(early) > 5 and len(late) > 5 else None
+
+
+def _spread(values: FloatArray) -> dict[str, float]:
+    return {f"p{p}": float(np.percentile(values, p)) for p in (50, 95, 99)} | {"max": float(values.max())}
 
 
 def write_scenario(folder: Path, targets: int) -> Path:

@@ -19,6 +19,7 @@ from trackmesh.protocol.messages import COASTING, CONFIRMED, TrackFrame
 
 NEAR_M = 600.0
 STALE_NS = 1_500_000_000
+CONCERN_ALL = ("router", "fusion", "client")
 Batch = tuple[str, str, int]
 """Sensor, boot id, sequence number."""
 
@@ -35,10 +36,17 @@ class Fault(NamedTuple):
 
 @dataclass
 class Judged:
-    """What a fault cost: seconds from healing until each target was tracked again, and who kept its number."""
+    """What a fault cost: seconds from healing until each target was tracked again, and who kept its number.
+
+    Attributes:
+        recovered_s: from the healing of this fault.
+        undisturbed_s: from the last healing until then of a fault that concerned all targets: others may have begun
+            before this one's consequences were over.
+    """
 
     fault: Fault
     recovered_s: dict[int, float] = field(default_factory=dict)
+    undisturbed_s: dict[int, float] = field(default_factory=dict)
     kept: dict[int, bool] = field(default_factory=dict)
 
     @property
@@ -73,7 +81,7 @@ class Judge:
         self.judged: list[Judged] = []
         self.now: dict[int, tuple[int, int]] = {}
         self.seen_ns = self.whole_ns = 0
-        self._last_ns = 0
+        self._last_ns = self._all_healed_ns = 0
 
     def take(self, found: dict[int, tuple[int, int]], targets: int, came_ns: int) -> None:
         """What a frame shows of the targets that there are, and when it came."""
@@ -87,12 +95,15 @@ class Judge:
             for target in sorted(one.missing):
                 track, updated_ns = found.get(target, (-1, 0))
                 if updated_ns > one.fault.healed_ns:
-                    one.recovered_s[target] = max(0.0, (came_ns - one.fault.healed_ns) / 1e9)
+                    one.recovered_s[target] = (came_ns - one.fault.healed_ns) / 1e9
+                    one.undisturbed_s[target] = (came_ns - max(one.fault.healed_ns, self._all_healed_ns)) / 1e9
                     one.kept[target] = track == one.fault.before[target]
 
     def healed(self, fault: Fault) -> None:
         """A fault is over."""
         self.judged.append(Judged(fault))
+        if fault.part in CONCERN_ALL:
+            self._all_healed_ns = fault.healed_ns
 
     def forget_dead(self, alive: Iterable[int]) -> None:
         """Targets that have left the area are nobody's fault."""

@@ -54,8 +54,21 @@ def test_recovery_needs_a_plot_from_after_the_healing_and_numbers_are_compared()
     judge.take({1: (7, 4 * S), 2: (9, 6 * S)}, 2, 7 * S)
     (one,) = judge.judged
     assert one.recovered_s == {1: 2.0, 2: 4.0} and one.kept == {1: True, 2: False}
+    assert one.undisturbed_s == one.recovered_s
     # It was whole from 1 to 4 s, of which only the first one and a half count, and from 4 to 5.
     assert (judge.seen_ns, judge.whole_ns) == (6 * S, 2.5 * S)
+
+
+def test_a_later_fault_that_concerns_all_restarts_the_clock_of_those_not_yet_tracked() -> None:
+    judge = Judge()
+    judge.healed(Fault("kill", "fusion", 0, 1 * S, {1: 7, 2: 8}))
+    judge.take({1: (7, 2 * S)}, 2, 3 * S)
+    judge.healed(Fault("kill", "north", 4 * S, 5 * S, {}))
+    judge.healed(Fault("cut", "client", 6 * S, 8 * S, {1: 7}))
+    judge.take({1: (7, 9 * S), 2: (8, 9 * S)}, 2, 10 * S)
+    first, _, last = judge.judged
+    assert first.recovered_s == {1: 2.0, 2: 9.0} and first.undisturbed_s == {1: 2.0, 2: 2.0}
+    assert last.recovered_s == {1: 2.0}
 
 
 def test_files_are_read_up_to_where_they_were_cut_off(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ _SHARED: dict[str, object] = {
 # No connect/timeout_ms: with it only the first endpoint is tried at the opening.
 _CLIENT: dict[str, object] = {
     "mode": "client",
-    "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
     "queries_default_timeout": 2000,
 }
 
