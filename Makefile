@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 SECONDS_ ?= 60
 MINUTES ?= 20
 
-.PHONY: demo test check studies bench chaos soak flood docker-check lock clean
+.PHONY: demo test check studies bench chaos soak flood links docker-check lock clean
 
 demo: $(VENV)/ready
 	$(BIN)/trackmesh demo --seconds $(SECONDS_)
@@ -42,6 +42,11 @@ chaos: $(VENV)/ready
 
 soak: $(VENV)/ready
 	$(BIN)/python -m benchmarks.faults.soak --minutes $(MINUTES) --out out/soak
+
+# As root: outages of large streams, 20 times; does a publisher ever stay cut off?
+links: $(VENV)/ready
+	$(BIN)/python -m tests.hosts.link_faults 1
+	$(BIN)/python -m tests.hosts.link_faults 4 pour4 pourcut4 pour4 pourcut4 pour4
 
 flood: $(VENV)/ready
 	$(BIN)/python -m benchmarks.faults.flood --out out/flood

@@ -32,6 +32,6 @@ def test_nothing_is_lost_and_nobody_is_wedged(outcomes: dict[str, Outcome], name
     assert (one.lost, one.disordered) == (0, 0), one
     # The other side of it: there was an outage.
     assert one.withheld > 50 or name == "loss", one
-    # Attempts come every second at most, and may each take two; what it takes is far less, see docs/faults.md. A large
+    # Attempts come every half second, and may each take two; what it takes is far less, see docs/faults.md. A large
     # stream is held up by its socket, too.
     assert one.joined_s < 5.0 or "pour" in name, one

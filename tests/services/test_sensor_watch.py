@@ -68,12 +68,18 @@ def test_a_sensor_of_whom_all_is_refused_is_told_with_the_reason() -> None:
 
 
 def test_clocks_are_told_beyond_their_limits_only() -> None:
-    for ahead_s, words in ((0.2, ""), (0.5, "0.48 s ahead"), (-0.2, ""), (-0.6, "0.62 s after their time")):
+    for ahead_s, words in ((0.2, ""), (0.5, "0.48 s ahead"), (-0.2, ""), (-0.6, "0.62 s after its time")):
         one = watch()
         one.expect("a", 1.0, AT)
         now_ns = feed(one, "a", 20.0, ahead_s)
         told = "".join(one.notices({"a"}, now_ns).values())
         assert words in told and bool(words) == bool(told), (ahead_s, told)
+
+
+def test_where_there_are_no_tokens_none_are_missed() -> None:
+    one = SensorWatch(Limits(0.25, 100.0), True, word="network")
+    one.expect("hall", 1.5, AT)
+    assert list(one.notices(None, AT + 6 * S).values()) == [f"Network hall is silent since {TOD}: no batch comes."]
 
 
 def test_a_recording_has_no_clock() -> None:

@@ -47,12 +47,14 @@ class SensorWatch:
         clocks: whether times are those of now; recordings bring times of their own.
         named: sensors that there must be, though they were never heard.
         began_ns: from when on they are missed.
+        word: what a sensor is called.
     """
 
     limits: Limits
     clocks: bool
     named: tuple[str, ...] = ()
     began_ns: int = 0
+    word: str = "sensor"
     _watched: dict[str, _Watched] = field(default_factory=dict)
 
     def expect(self, sensor_id: str, period_s: float, now_ns: int) -> None:
@@ -93,11 +95,16 @@ class SensorWatch:
         one = self._watched.get(sensor_id)
         return None if one is None or not _overdue(one, one.heard_ns, now_ns) else one.heard_ns
 
-    def notices(self, alive: Iterable[str], now_ns: int) -> dict[str, str]:
-        """What is wrong now: a sentence each, by a name that stays while it lasts."""
-        return self._silences(set(alive), now_ns) | self._refusals(now_ns) | self._clocks()
+    def notices(self, alive: Iterable[str] | None, now_ns: int) -> dict[str, str]:
+        """What is wrong now: a sentence each, by a name that stays while it lasts.
 
-    def _silences(self, alive: set[str], now_ns: int) -> dict[str, str]:
+        Args:
+            alive: sensors whose tokens are there; None: they have none.
+            now_ns: the time.
+        """
+        return self._silences(None if alive is None else set(alive), now_ns) | self._refusals(now_ns) | self._clocks()
+
+    def _silences(self, alive: set[str] | None, now_ns: int) -> dict[str, str]:
         silent = {
             name: one.heard_ns
             for name, one in self._watched.items()
@@ -106,8 +113,8 @@ class SensorWatch:
         if now_ns - self.began_ns > SILENT_S * 1e9:
             silent |= {name: self.began_ns for name in self.named if name not in self._watched}
         return {
-            f"silent {name}": f"Sensor {name} is silent since {clock_time(since_ns)}: "
-            + ("alive, but no batch comes." if name in alive else "not alive: process, host or link is down.")
+            f"silent {name}": f"{self.word.capitalize()} {name} is silent since {clock_time(since_ns)}: "
+            + _why_silent(name, alive)
             for name, since_ns in sorted(silent.items())
         }
 
@@ -116,7 +123,9 @@ class SensorWatch:
         for name, one in sorted(self._watched.items()):
             if one.told and _overdue(one, one.taken_ns, now_ns) and not _overdue(one, one.heard_ns, now_ns):
                 since = clock_time(one.taken_ns)
-                found[f"refused {name}"] = f"Nothing of sensor {name} is taken since {since}: refused ({one.reason})."
+                found[f"refused {name}"] = (
+                    f"Nothing of {self.word} {name} is taken since {since}: refused ({one.reason})."
+                )
         return found
 
     def _clocks(self) -> dict[str, str]:
@@ -125,25 +134,34 @@ class SensorWatch:
             known = one.clock.estimate()
             if (sentence := self._offset(name, known, one.look_s)) is not None:
                 found[f"clock {name}"] = sentence
-            if known.drift_ppm is not None and abs(known.drift_ppm) > max(
-                self.limits.drift_ppm, DRIFT_SIGMAS * known.drift_sigma_ppm
-            ):
-                way = "gains" if known.drift_ppm > 0 else "loses"
-                found[f"drift {name}"] = (
-                    f"The clock of sensor {name} {way} {abs(known.drift_ppm):.0f} ± {known.drift_sigma_ppm:.0f} ppm "
-                    f"({abs(known.drift_ppm) * 3.6e-3:.2f} s an hour)."
-                )
+            if (sentence := self._drift(name, known)) is not None:
+                found[f"drift {name}"] = sentence
         return found
+
+    def _drift(self, name: str, known: ClockEstimate) -> str | None:
+        if known.drift_ppm is None:
+            return None
+        if abs(known.drift_ppm) <= max(self.limits.drift_ppm, DRIFT_SIGMAS * known.drift_sigma_ppm):
+            return None
+        way, ppm = "gains" if known.drift_ppm > 0 else "loses", abs(known.drift_ppm)
+        told = f"{ppm:.0f} ± {known.drift_sigma_ppm:.0f} ppm ({ppm * 3.6e-3:.2f} s an hour)"
+        return f"The clock of {self.word} {name} {way} {told}."
 
     def _offset(self, name: str, known: ClockEstimate, look_s: float) -> str | None:
         if known.offset_s is None:
             return None
         if known.offset_s > self.limits.offset_s:
-            return f"The clock of sensor {name} is {known.offset_s:.2f} s ahead."
+            return f"The clock of {self.word} {name} is {known.offset_s:.2f} s ahead."
         if -known.offset_s > self.limits.offset_s + look_s:
-            late = f"Plots of sensor {name} come {-known.offset_s:.2f} s after their time"
+            late = f"What {self.word} {name} sends comes {-known.offset_s:.2f} s after its time"
             return f"{late}: its clock is behind, or they are late."
         return None
+
+
+def _why_silent(name: str, alive: set[str] | None) -> str:
+    if alive is None:
+        return "no batch comes."
+    return "alive, but no batch comes." if name in alive else "not alive: process, host or link is down."
 
 
 def _overdue(one: _Watched, last_ns: int, now_ns: int) -> bool:

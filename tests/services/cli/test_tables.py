@@ -8,7 +8,7 @@ from rich.table import Table
 from tests.protocol.builders import frame
 
 from trackmesh.protocol.messages import UNKNOWN_HEIGHT_M2, SensorBias, SensorHealth, ServiceStatus
-from trackmesh.services.cli.tables import bias_text, status_table, track_table
+from trackmesh.services.cli.tables import bias_text, degraded_lines, status_table, track_table
 
 
 def text(table: Table) -> str:
@@ -37,6 +37,21 @@ def test_inputs_are_told_in_tracks_and_frames_and_sensors_in_plots_and_batches()
     )  # fmt: skip
     shown = text(status_table([status]))
     assert "7 plots, 3 batches, 0 missing, 1 refused" in shown and "7 tracks, 3 frames, 0 missing, 1 refused" in shown
+
+
+def test_silence_and_clocks_of_sensors_are_shown_and_what_is_missing_is_told() -> None:
+    counts = dict.fromkeys(("plots", "batches", "gaps", "duplicates", "refused"), 0)
+    heard = [
+        SensorHealth(sensor_id="a", alive=False, silent_since_ns=5, last_t_ns=10**9, **counts),
+        SensorHealth(sensor_id="b", alive=True, clock_offset_s=0.31, clock_drift_ppm=-120.0, **counts),
+    ]
+    status = ServiceStatus(
+        kind="fusion", unit_id="main", boot_id="x", seq=0, t_ns=4 * 10**9, state="ready", uptime_s=1.0, sensors=heard,
+        degraded=["Sensor a is silent since 12:00:00 UTC: not alive: process, host or link is down."],
+    )  # fmt: skip
+    shown = text(status_table([status]))
+    assert "gone, silent" in shown and "3.0" in shown and "clock +0.31 s, -120 ppm" in shown
+    assert degraded_lines([status]) == [f"fusion main: {status.degraded[0]}"]
 
 
 def test_a_bias_is_told_with_its_error_and_in_brackets_where_it_is_not_applied() -> None:

@@ -14,6 +14,7 @@ from trackmesh.protocol.files import Gone, RecordWriter, Tick, UnitRecord
 from trackmesh.protocol.keys import kind_and_id, last_chunk
 from trackmesh.protocol.messages import RangeBatch, SensorHealth, SensorInfo, TagFrame
 from trackmesh.services.runtime import Health, ServiceRuntime
+from trackmesh.services.sensor_watch import Limits, SensorWatch
 from trackmesh.services.streams import Streams
 from trackmesh.services.tags.engine import TagEngine, Unit
 from trackmesh.services.tags.reader_file import ReaderFile
@@ -28,6 +29,8 @@ _ASK_EVERY_S = 1.0
 _ASKED_AT_ONCE = 16
 _FILE_EVERY_S = 1.0
 _SILENT_AFTER_S = 5.0
+_NETWORK_PERIOD_S = 1.5
+_CLOCKS = Limits(offset_s=0.25, drift_ppm=100.0)
 
 
 class TagService:
@@ -44,6 +47,7 @@ class TagService:
         self._unknown: set[str] = set()
         self._answered: Buffer[SensorInfo] = Buffer(_ASKED_AT_ONCE)
         self._heard_s: dict[str, float] = {}
+        self._watch = SensorWatch(_CLOCKS, settings.clock == "wall", word="network")
         self._file = ReaderFile(settings.readers) if settings.readers else None
         self._tick_due_s = self._file_due_s = 0.0
         self._black_box: RecordWriter | None = None
@@ -78,11 +82,12 @@ class TagService:
         with self._lock:
             figures, counts = self.engine.figures(), self.engine.counts()
             known = list(self.engine.readers.infos)
+            notices = self._watch.notices(None, time.time_ns())
         figures |= {f"engine.{name}": float(value) for name, value in counts.items()}
         figures["readers_alive"] = float(sum(name in self._alive for name in known))
         figures["batches_dropped_here"] = float(self._ranges.dropped)
         networks = [self._network_health(name) for name in sorted(self.streams.known)]
-        return Health(figures, networks)
+        return Health(figures, networks, notices)
 
     # --- the engine's thread ---
 
@@ -143,14 +148,23 @@ class TagService:
                 raise RefusedMessage("wrong_sensor", f"{sample.key} brought ranges of {batch.network_id}.")
             if network_id not in self.streams.known and len(self.streams.known) >= _NETWORKS_HELD:
                 raise RefusedMessage("too_many_sensors", f"There are {_NETWORKS_HELD} networks already.")
-            now_ns = time.time_ns() if self.settings.clock == "wall" else None
-            self.streams.check(network_id, batch.boot_id, batch.seq, batch.t_ns, now_ns)
+            now_ns = time.time_ns()
+            self._note_heard(batch, now_ns)
+            of_now = self.settings.clock == "wall"
+            self.streams.check(network_id, batch.boot_id, batch.seq, batch.t_ns, now_ns if of_now else None)
         except RefusedMessage as error:
             self._refuse(network_id, error)
             return
         self._heard_s[network_id] = time.monotonic()
+        self._watch.took(network_id, now_ns)
         self._note_unknown(batch)
         self._take_batch(batch)
+
+    def _note_heard(self, batch: RangeBatch, now_ns: int) -> None:
+        with self._lock:
+            self._watch.expect(batch.network_id, _NETWORK_PERIOD_S, now_ns)
+            newest_ns = int(batch.t_ns.max()) if len(batch.t_ns) else None
+            self._watch.heard(batch.network_id, newest_ns, 1, now_ns)
 
     def _take_batch(self, batch: RangeBatch) -> None:
         self._record(batch)
@@ -261,12 +275,14 @@ class TagService:
 
     def _refuse(self, network_id: str | None, error: RefusedMessage) -> None:
         self.runtime.counters.refuse(error.reason)
+        if network_id is not None:
+            self._watch.refused(network_id, error.reason)
         if network_id in self.streams.known:
             self.streams.known[network_id].refused += 1
         self.runtime.log.debug("refused: %s", error)
 
     def _network_health(self, network_id: str) -> SensorHealth:
-        stream = self.streams.known[network_id]
+        stream, clock = self.streams.known[network_id], self._watch.clock(network_id)
         return SensorHealth(
             sensor_id=network_id,
             alive=time.monotonic() - self._heard_s.get(network_id, -math.inf) < _SILENT_AFTER_S,
@@ -277,6 +293,9 @@ class TagService:
             refused=stream.refused,
             last_seq=max(stream.seq, 0),
             last_t_ns=stream.last_t_ns,
+            silent_since_ns=self._watch.silent_since_ns(network_id, time.time_ns()),
+            clock_offset_s=clock.offset_s,
+            clock_drift_ppm=clock.drift_ppm,
         )
 
 
