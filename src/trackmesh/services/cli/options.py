@@ -124,7 +124,9 @@ def reach(endpoint: str, config: Path | None = None) -> None:
     from trackmesh.protocol.zenoh_bus import ZenohBus
 
     settings = ServiceSettings.load(config)
-    ZenohBus.open([endpoint], timeout_s=PROBE_S, config_path=settings.zenoh_config).close()
+    ZenohBus.open(
+        [endpoint], timeout_s=PROBE_S, config_path=settings.zenoh_config, credentials=settings.credentials()
+    ).close()
 
 
 def corners(text: str | None, option: str) -> list[float] | None:
