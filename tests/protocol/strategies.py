@@ -40,6 +40,7 @@ from trackmesh.protocol.messages import (
     TrackFrame,
     TrackQuery,
     TruthFrame,
+    UnitArea,
 )
 from trackmesh.protocol.messages.base import TopMessage
 from trackmesh.protocol.messages.plots import COLUMN_BOUNDS, COLUMN_SETS, LARGEST_SIGMA
@@ -392,6 +393,17 @@ envelopes = (
 
 unit = {"unit_id": ids, **header, "t_ns": times_ns}
 
+
+@st.composite
+def unit_areas(draw: st.DrawFn) -> UnitArea:
+    area = fields(
+        unit_number=st.integers(0, 4095), started_t_ns=times_ns, origin=maybe(places), width_m=real(1e-3, 1e9),
+        state=st.sampled_from(["joining", "active", "standby"]),
+    )  # fmt: skip
+    given_ = draw(arrays(UnitArea, k=draw(lengths)))
+    return UnitArea(**given_ | draw(area))
+
+
 VALID: dict[type[TopMessage], Strategy] = {
     SensorInfo: sensor_infos(),
     PlotBatch: plot_batches(),
@@ -401,7 +413,7 @@ VALID: dict[type[TopMessage], Strategy] = {
     TagFrame: tag_frames(),
     TrackQuery: st.builds(TrackQuery, **query_fields),
     HistoryQuery: history_queries(),
-    BandFrame: built(BandFrame, fields(**unit)),
+    BandFrame: built(BandFrame, fields(**unit, area=unit_areas())),
     Registration: st.builds(Registration, **unit, sensors=st.lists(sensor_biases, max_size=2)),
     EmiScanBatch: scan_batches(),
     EmiResult: results,

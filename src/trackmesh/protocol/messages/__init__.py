@@ -32,6 +32,7 @@ from trackmesh.protocol.messages.tracks import (
     SensorBias,
     TrackFrame,
     TrackQuery,
+    UnitArea,
 )
 from trackmesh.protocol.messages.truth import TruthFrame
 
@@ -97,4 +98,5 @@ __all__ = [
     "TrackFrame",
     "TrackQuery",
     "TruthFrame",
+    "UnitArea",
 ]

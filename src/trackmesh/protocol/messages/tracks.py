@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -138,19 +138,43 @@ class HistoryQuery(TrackQuery):
         return self
 
 
+class UnitArea(Message):
+    """What a unit of a realm with several looks after.
+
+    Its area is the Voronoi cell of ``centre_enu_m`` among those of the units that are active, or the convex polygon
+    ``polygon_enu_m``; ``width_m`` is how far beyond it plots are taken. ``state`` is ``joining`` while the unit learns
+    its tracks, ``active`` once it owns its area, ``standby`` if it waits for the active unit of the same area to die.
+    """
+
+    unit_number: Annotated[int, Field(ge=0, le=4095)]
+    started_t_ns: UnixNs
+    origin: Geodetic | None = None
+    centre_enu_m: Annotated[FloatArray, ArrayField("<f8", (2,), ge=-1e9, le=1e9)]
+    polygon_enu_m: Annotated[FloatArray, ArrayField("<f8", ("k", 2), ge=-1e9, le=1e9)] | None = None
+    width_m: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
+    state: Literal["joining", "active", "standby"]
+
+
 class BandFrame(TopMessage):
-    """What a unit tells its neighbours: its confirmed tracks near the border, with their last plots' keys."""
+    """What a unit tells its neighbours: its area, and its confirmed tracks near the border with their last plots' keys.
+
+    A unit without others near tells its area alone. ``plot_keys`` are those of the last plots, the youngest last, -1
+    where there are fewer.
+    """
+
+    most_bytes: ClassVar[int] = 16 * 2**20
 
     unit_id: Id
     boot_id: BootId
     seq: Seq
     t_ns: UnixNs
+    area: UnitArea
     track_id: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0, le=2**53)]
     owner: Annotated[UInt8Array, ArrayField("|u1", ("n",), le=1)]
     epoch: Annotated[UInt32Array, ArrayField("<u4", ("n",))]
     first_t_ns: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0)]
     updated_t_ns: Annotated[IntArray, ArrayField("<i8", ("n",), ge=0)]
-    plot_keys: Annotated[IntArray, ArrayField("<i8", ("n", 6))]
+    plot_keys: Annotated[IntArray, ArrayField("<i8", ("n", 6), ge=-1)]
     state: Annotated[Float32Array, ArrayField("<f4", ("n", 4))]
     covariance: Annotated[Float32Array, ArrayField("<f4", ("n", 10))]
 

@@ -17,7 +17,7 @@ from trackmesh.services.estimation.alpha_beta import combined_gains, manoeuvring
 from trackmesh.services.estimation.gating import Mixture, Strength, make_mixture
 from trackmesh.services.estimation.jit import kernel
 from trackmesh.services.estimation.joint import NO_ODDS, Odds
-from trackmesh.services.estimation.plots import Move, Plot, Plots, empty_plots
+from trackmesh.services.estimation.plots import Move, Plot, Plots, empty_plots, make_plots
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -166,6 +166,15 @@ class AlphaBetaTracks:
     def begin(self, rows: IntArray, plots: Plots) -> None:
         """Start tracks in rows, from one plot each."""
         _begin(self._rows, rows, plots, self._sigma_v_mps)
+
+    def begin_at(self, rows: IntArray, x: FloatArray, P: FloatArray, t_s: float) -> None:
+        """Start tracks in rows, each from a state (4,) and a covariance (4, 4) at a time."""
+        R = np.stack([P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]], axis=1)
+        self.begin(rows, make_plots(x[:, :2], R, t_s))
+        own = self._rows
+        own.x[rows], own.P[rows] = x, P
+        own.spread[rows, 1] = np.abs(P[:, 0, 2]) + np.abs(P[:, 1, 3])
+        own.spread[rows, 2] = P[:, 2, 2] + P[:, 3, 3]
 
     def feed(self, rows: IntArray, plots: Plots) -> BoolArray:
         """Feed plot k to row k, no row twice; False where it comes too late."""

@@ -71,6 +71,13 @@ class BiasFilter:
         self.prior[block(k)], self.walk[block(k)] = prior, walk
         self._forget(k)
 
+    def suppose(self, k: int, beta: FloatArray, P: FloatArray) -> None:
+        """What sensor k is wrong by, (3,) and (3, 3), as others know it; zero where there is no prior."""
+        self._forget(k)
+        free = self.prior[block(k)] > 0.0
+        self.beta[block(k)] = np.where(free, beta, 0.0)
+        self.P[block(k), block(k)] = np.where(free[:, None] & free, P, 0.0)
+
     def _forget(self, k: int) -> None:
         self.beta[block(k)] = 0.0
         self.P[block(k)] = self.P[:, block(k)] = 0.0

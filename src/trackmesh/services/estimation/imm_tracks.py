@@ -12,7 +12,7 @@ from trackmesh.services.estimation.bank import Models
 from trackmesh.services.estimation.gating import Mixture, Strength, make_mixture
 from trackmesh.services.estimation.joint import NO_ODDS, Odds
 from trackmesh.services.estimation.motion import TURN
-from trackmesh.services.estimation.plots import Move, Plots
+from trackmesh.services.estimation.plots import Move, Plots, make_plots
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -71,6 +71,12 @@ class ImmTracks:
     def begin(self, rows: IntArray, plots: Plots) -> None:
         """Start tracks in rows, from one plot each."""
         tracks.begin(self.filters, rows, plots, self._sigma_v_mps)
+
+    def begin_at(self, rows: IntArray, x: FloatArray, P: FloatArray, t_s: float) -> None:
+        """Start tracks in rows, each from a state (4,) and a covariance (4, 4) at a time."""
+        R = np.stack([P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]], axis=1)
+        tracks.begin(self.filters, rows, make_plots(x[:, :2], R, t_s), self._sigma_v_mps)
+        tracks.begin_at(self.filters, rows, x, P)
 
     def feed(self, rows: IntArray, plots: Plots) -> BoolArray:
         """Feed plot k to row k; False where it comes too late."""

@@ -22,6 +22,7 @@ class Plot(Protocol):
         site: (2,) where the sensor stood in the plane. site_velocity: (2,) how it moved itself.
         level: cosine of the elevation under which it sees the plot.
         height_m: of the target; height_variance_m2: its variance, infinite where it is unknown.
+        key: names the plot where several units hear the same ones, else 0.
     """
 
     z: FloatArray
@@ -35,6 +36,7 @@ class Plot(Protocol):
     level: float
     height_m: float
     height_variance_m2: float
+    key: int
 
 
 Plots: TypeAlias = npt.NDArray[Any]
@@ -59,6 +61,7 @@ _PLOT = np.dtype(
             ("level", "f8"),
             ("height_m", "f4"),
             ("height_variance_m2", "f4"),
+            ("key", "i8"),
         ],
     )
 )

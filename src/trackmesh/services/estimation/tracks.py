@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from trackmesh.services.estimation import gating, imm, printed
+from trackmesh.services.estimation import gating, imm, lags, printed
 from trackmesh.services.estimation.bank import Models, States, as_array, make_states, make_work
 from trackmesh.services.estimation.gating import Mixture, Strength
 from trackmesh.services.estimation.jit import kernel
@@ -105,6 +105,21 @@ def begin(f: Filters, rows: IntArray, plots: Plots, sigma_v_mps: float) -> None:
         imm.begin(f.models[0], f.head[i], plots[k], sigma_v_mps)
         f.base[i] = f.head[i]
         f.ring_n[i] = f.mid_n[i] = 0
+        _summarise(f, i)
+
+
+@kernel
+def begin_at(f: Filters, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
+    """Let filters that ``begin`` has just started stand at known states x (n, 4), P (n, 4, 4) in every model."""
+    for k in range(len(rows)):
+        i = rows[k]
+        for j in range(len(f.models[0].kind)):
+            for a in range(4):
+                f.head[i].x[j, a] = x[k, a]
+                for b in range(4):
+                    f.head[i].P[j, a, b] = P[k, a, b]
+        lags.renew(f.head[i])
+        f.base[i] = f.head[i]
         _summarise(f, i)
 
 

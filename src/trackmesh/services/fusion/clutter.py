@@ -9,6 +9,8 @@ counts.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 
@@ -17,6 +19,8 @@ from trackmesh.services.estimation.plots import Plots
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
+Within = Callable[[FloatArray], BoolArray]
+"""Which of points (n, 2) are meant."""
 
 _LOOKS_REMEMBERED = 5.0
 _LOOKS_REMEMBERED_BY_CELLS = 30.0
@@ -45,6 +49,8 @@ class Clutter:
         self._cell_m = 2.0 * max_range_m / _CELLS
         self._cells = np.zeros((_CELLS, _CELLS))
         self._looks = 0.0
+        self._placed = site is not None
+        self._within: Within | None = None
         self._covered_m2 = _covered(_CELLS) * self._cell_m**2 if areas and site is not None else None
 
     def add(self, plots: Plots, explained: BoolArray, share_of_look: float) -> None:
@@ -65,9 +71,29 @@ class Clutter:
         if not steps.any():
             return
         self._corner = self._corner + steps * self._cell_m
+        if self._within is not None:
+            self._measure()
         old, self._cells = self._cells, np.zeros((_CELLS, _CELLS))
         (to_i, from_i), (to_j, from_j) = (_overlap(int(step)) for step in steps)
         self._cells[to_i, to_j] = old[from_i, from_j]
+
+    def limit(self, within: Within | None) -> None:
+        """Plots come from a part of the coverage only; what was counted area by area is counted anew."""
+        if not self._placed:
+            return
+        self._within = within
+        self._cells[:], self._looks = 0.0, 0.0
+        self._measure()
+
+    def _measure(self) -> None:
+        """How large the coverage is, or what is left of it."""
+        shares, area_m2 = _covered(_CELLS), float(np.pi * self._max_range_m**2)
+        if self._within is not None:
+            shares = shares_within(self._corner, self._cell_m, self._within)
+            area_m2 = max(float(shares.sum()), 1.0) * self._cell_m**2
+        self._area_m2, self._floor = area_m2, 0.5 / area_m2
+        if self._covered_m2 is not None:
+            self._covered_m2 = shares * self._cell_m**2
 
     def whole(self, plots_now: int = 0, share_of_look: float = 1.0) -> float:
         """The density over all, 1/m^2; before any batch was counted, that of the batch at hand."""
@@ -106,6 +132,16 @@ def _covered(cells: int) -> FloatArray:
     fine = (np.arange(cells * _POINTS) + 0.5) / (cells * _POINTS) * 2.0 - 1.0
     inside = fine[:, None] ** 2 + fine**2 < 1.0
     return np.asarray(inside.reshape(cells, _POINTS, cells, _POINTS).mean(axis=(1, 3)))
+
+
+def shares_within(corner: FloatArray, cell_m: float, within: Within) -> FloatArray:
+    """As ``_covered``, of what lies ``within`` alone; the grid has its lower left corner (2,) there."""
+    fine = (np.arange(_CELLS * _POINTS) + 0.5) / (_CELLS * _POINTS) * 2.0 - 1.0
+    east, north = np.meshgrid(fine, fine, indexing="ij")
+    inside = east**2 + north**2 < 1.0
+    points = corner + (np.stack([east, north], axis=-1)[inside] + 1.0) * (0.5 * _CELLS * cell_m)
+    inside[inside] = within(points)
+    return np.asarray(inside.reshape(_CELLS, _POINTS, _CELLS, _POINTS).mean(axis=(1, 3)))
 
 
 @kernel

@@ -37,6 +37,7 @@ class TrackFilters(Protocol):
     def figures(self) -> dict[str, int]: ...  # noqa: D102
 
     def begin(self, rows: IntArray, plots: Plots) -> None: ...  # noqa: D102
+    def begin_at(self, rows: IntArray, x: FloatArray, P: FloatArray, t_s: float) -> None: ...  # noqa: D102
     def feed(self, rows: IntArray, plots: Plots) -> BoolArray: ...  # noqa: D102
     def feed_from(self, source: int, target: int) -> None: ...  # noqa: D102
     def associate(  # noqa: D102
@@ -169,6 +170,17 @@ class Layer:
         told = [(i, int(self.life.uid[i]), int(self.life.link[i])) for i in gone if self.life.confirmed[i]]
         self._free += gone
         return confirmed[:n_confirmed], told
+
+    def seed(self, x: FloatArray, P: FloatArray, t_s: float, first_s: FloatArray, score: float) -> IntArray:
+        """Start confirmed tracks from states (n, 4), (n, 4, 4) at a time that somebody else knows; their rows."""
+        rows = self._take(len(x))
+        self.filters.begin_at(rows, x, P, t_s)
+        lives.born(self.life, rows, self._next_uid, np.full(len(rows), t_s), 0)
+        self._next_uid += len(rows)
+        self.life.first_s[rows] = first_s
+        self.life.score[rows] = self.life.best[rows] = score
+        self.life.confirmed[rows] = True
+        return rows
 
     def adopt(self, plots: list[Plots], score: FloatArray) -> IntArray:
         """Start confirmed tracks, each from the plots that are known of it, in order of time; their rows."""

@@ -138,6 +138,18 @@ class Registration:
         """The covariance of ``difference`` alone, for whoever has both shifts already."""
         return self._filter.difference_covariance(self._index[a], at_a, self._index[b], at_b)
 
+    def suppose(self, sensor_id: str, beta: FloatArray, P: FloatArray) -> Change:
+        """Take over what another unit knows of a sensor, (3,) and (3, 3), and apply it at once; the change."""
+        k = self._index[sensor_id]
+        self._filter.suppose(k, beta, P)
+        change = self._change(k, "moved", self._filter.bias(k).copy())
+        self._sensors[k].applied, self._sensors[k].locked = change.after, True
+        return change
+
+    def pairs(self, sensor_id: str) -> int:
+        """How many pairs of tracks have told of a sensor."""
+        return self._sensors[self._index[sensor_id]].pairs
+
     # --- what it learns from ---
 
     def due(self, a: str, b: str, t_s: float) -> bool:

@@ -9,6 +9,7 @@ freedom. Among several the best fit counts, one to one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,6 +48,9 @@ class Stitching:
         system: the layer of system tracks.
         stitch_s: how long after its last plot a lost track can be taken over; 0: never.
         q_m2ps3: acceleration noise over the gap.
+
+    Attributes:
+        ours: which numbers (n,) may be taken over; those of tracks that another unit goes on with may not.
     """
 
     def __init__(self, system: Layer, stitch_s: float, q_m2ps3: float) -> None:
@@ -54,12 +58,25 @@ class Stitching:
         self._stitch_s = stitch_s
         self._q_m2ps3 = q_m2ps3
         self._lost = Lost(np.empty((0, 4)), np.empty((0, 4, 4)), np.empty(0), np.empty(0, np.int64), np.empty(0), [])
+        self.ours: Callable[[IntArray], npt.NDArray[np.bool_]] = lambda number: np.ones(len(number), np.bool_)
 
     def __len__(self) -> int:
         return len(self._lost.words)
 
+    @property
+    def numbers(self) -> IntArray:
+        """Public numbers (n,) of the lost tracks."""
+        return self._lost.number
+
+    def forget(self, numbers: IntArray) -> None:
+        """Give up lost tracks of these numbers without a word: another unit goes on with them."""
+        if len(self):
+            self._keep(~np.isin(self._lost.number, numbers))
+
     def lose(self, rows: IntArray, words: TrackFrame) -> None:
         """Rows left the picture; ``words`` is what has to be told should they not come back."""
+        ours = self.ours(self._system.life.link[rows])
+        rows, words = rows[ours], frames.take(words, ours)
         if not len(rows):
             return
         x, P, t_s = self._last_states(rows)
@@ -126,7 +143,8 @@ class Stitching:
         life = self._system.life
         rows = self._system.rows
         rows = rows[life.confirmed[rows] & (life.last_s[rows] < life.first_s[new].max())]
-        return np.asarray(rows[~np.isin(rows, new)])
+        rows = rows[~np.isin(rows, new)]
+        return np.asarray(rows[self.ours(life.link[rows])])
 
     def _fitting(
         self, old: tuple[FloatArray, FloatArray], old_t_s: FloatArray, new: IntArray, now_s: float
