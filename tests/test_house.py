@@ -45,7 +45,9 @@ def test_numerics_know_no_clock_no_log_no_messages() -> None:
 
 
 def test_the_fusion_engine_knows_no_clock_and_no_network() -> None:
-    for name in ("engine", "layer", "life", "association", "membership", "sensors", "frames", "intake", "rates"):
+    engines = ("engine", "layer", "life", "association", "membership", "sensors", "frames", "intake", "rates")
+    partition = [f"partition/{part}" for part in ("areas", "band", "engine", "neighbours", "ownership", "pairing")]
+    for name in (*engines, *partition):
         path = ROOT / f"src/trackmesh/services/fusion/{name}.py"
         imported = _imports(path)
         assert not {n.split(".")[0] for n in imported} & {"time", "logging", "threading", "zenoh"}, path

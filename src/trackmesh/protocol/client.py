@@ -16,11 +16,12 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Generic, NamedTuple, Self, TypeVar
 
-from trackmesh.protocol.bus import Bus, Sample, Subscription
+from trackmesh.protocol.bus import AliveSubscription, Bus, Sample, Subscription
 from trackmesh.protocol.codec import decode, encode, encoding, open_envelope
 from trackmesh.protocol.errors import Incomplete, QueryFailed, RefusedMessage, Unavailable
 from trackmesh.protocol.inversion import Inversion
 from trackmesh.protocol.keys import DEFAULT_REALM, Keys, kind_and_id, last_chunk
+from trackmesh.protocol.merging import LatestFrames
 from trackmesh.protocol.messages import (
     EmiResult,
     EmiScanBatch,
@@ -42,6 +43,7 @@ __all__ = [
     "Client",
     "Incomplete",
     "Inversion",
+    "LatestFrames",
     "Picture",
     "RangePublisher",
     "SensorPublisher",
@@ -156,6 +158,10 @@ class Client:
         """Frames as they are published; with ``history`` those lost in an outage too, and the last few before now."""
         return Watch(self.bus.subscribe(self.keys.tracks(unit), history=history, capacity=capacity), TrackFrame)
 
+    def watch_units(self) -> AliveSubscription:
+        """Comings and goings of fusion units, those already there first; for ``note_alive`` of a picture."""
+        return self.bus.watch_alive(self.keys.live("fusion", "*"))
+
     def watch_refined(self, unit: str = "*", *, capacity: int = 4096) -> Watch[RefinedFrame]:
         """Refined states of some plots ago, of units whose ``lag`` is set."""
         return Watch(self.bus.subscribe(self.keys.refined(unit), history=True, capacity=capacity), RefinedFrame)
@@ -178,6 +184,8 @@ class Client:
         self, query: TrackQuery | None = None, unit: str = "*", *, timeout_s: float = 2.0
     ) -> list[TrackFrame]:
         """The present picture, one frame a unit, ordered by unit.
+
+        A track on its way from one unit to another may be in both: see ``merging.without_doubles``.
 
         Raises:
             Unavailable: no unit answers.

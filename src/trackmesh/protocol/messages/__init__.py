@@ -33,6 +33,7 @@ from trackmesh.protocol.messages.tracks import (
     TrackFrame,
     TrackQuery,
     UnitArea,
+    symmetric,
 )
 from trackmesh.protocol.messages.truth import TruthFrame
 
@@ -99,4 +100,5 @@ __all__ = [
     "TrackQuery",
     "TruthFrame",
     "UnitArea",
+    "symmetric",
 ]

@@ -15,9 +15,11 @@ from rich.console import Group
 from rich.live import Live
 from rich.text import Text
 
-from trackmesh.protocol.client import Watch
+from trackmesh.protocol.client import LatestFrames, Watch
 from trackmesh.protocol.codec import refusal
 from trackmesh.protocol.files import RecordWriter, read_records, to_line
+from trackmesh.protocol.keys import last_chunk
+from trackmesh.protocol.merging import without_doubles
 from trackmesh.protocol.messages import TagFrame, TrackFrame, TrackQuery
 from trackmesh.services.cli.attention import Attention, routers_down
 from trackmesh.services.cli.options import (
@@ -57,8 +59,8 @@ def watch(
 ) -> None:
     """Follow the tracks as they are published.
 
-    On a terminal as a table, tags below the tracks; into a pipe, unless there is --out, as JSON lines of tracks, or
-    with --tags of tags.
+    On a terminal as one table of the tracks of all units, tags below; into a pipe, unless there is --out, as JSON lines
+    of tracks, or with --tags of tags.
     """
     as_json = as_json or not (out.is_terminal or out_path)
     stop = threading.Event()
@@ -74,10 +76,13 @@ def watch(
             watched.append(opened.enter_context(ask.watch_tags(unit)))
         live = opened.enter_context(Live(console=out, auto_refresh=False, transient=True))
         statuses = opened.enter_context(ask.watch_statuses())
-        seen = Seen(Attention(ask.bus.links))
+        seen, alive = Seen(Attention(ask.bus.links)), ask.watch_units()
+        opened.callback(alive.close)
         while not stop.is_set() and time.monotonic() < deadline_s:
             while (status := statuses.receive(timeout_s=0)) is not None:
                 seen.attention.take(status)
+            while (event := alive.receive(timeout_s=0)) is not None:
+                seen.units.note_alive(last_chunk(event.key), event.alive)
             if out.is_terminal and not as_json:
                 live.update(seen.tables(max(5, out.height - 6)), refresh=True)
             for frames in watched:
@@ -93,11 +98,11 @@ def watch(
 
 
 class Seen:
-    """The last frames heard, for the eye, and below them what is missing or wrong."""
+    """The last frames heard, for the eye: one picture of the tracks of all units; below, what is missing or wrong."""
 
     def __init__(self, attention: Attention) -> None:
         self.attention = attention
-        self._tracks: TrackFrame | None = None
+        self.units = LatestFrames()
         self._tags: TagFrame | None = None
 
     def take(self, frame: TrackFrame | TagFrame) -> None:
@@ -105,14 +110,14 @@ class Seen:
         if isinstance(frame, TagFrame):
             self._tags = frame
         else:
-            self._tracks = frame
+            self.units.update(frame)
 
     def tables(self, most: int) -> Group:
         """Tracks and tags, as many rows as there is room for."""
         wrong = [Text(line, style="yellow") for line in self.attention.lines()]
-        most = max(3, most - len(wrong))
-        share = most if self._tracks is None or self._tags is None else most // 2 - 2
-        tables = [] if self._tracks is None else [track_table([self._tracks], most=share)]
+        most, frames = max(3, most - len(wrong)), self.units.frames()
+        share = most if not frames or self._tags is None else most // 2 - 2
+        tables = [track_table(frames, most=share)] if frames else []
         return Group(*tables, *([] if self._tags is None else [tag_table([self._tags], most=share)]), *wrong)
 
 
@@ -149,7 +154,7 @@ def tracks(
     except ValidationError as error:
         raise refusal("TrackQuery", error) from None
     with client(connect, realm, config) as ask:
-        frames = ask.query_tracks(query, unit)
+        frames = without_doubles(ask.query_tracks(query, unit))
     if as_json:
         for frame in frames:
             print(to_line(frame))

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterator
 
 from trackmesh.protocol.buffer import Buffer
-from trackmesh.protocol.bus import Query, Sample
+from trackmesh.protocol.bus import Query, Sample, Subscription
 from trackmesh.protocol.codec import decode, encode, encoding, open_envelope
 from trackmesh.protocol.errors import QueryFailed, RefusedMessage, TrackmeshError
 from trackmesh.protocol.files import Tick
@@ -20,6 +20,8 @@ from trackmesh.services.fusion.engine import FusionEngine, Unit
 from trackmesh.services.fusion.input_feed import InputFeed
 from trackmesh.services.fusion.intake import Intake
 from trackmesh.services.fusion.keeping import Keeper
+from trackmesh.services.fusion.partition.feed import PartitionFeed, partitioned_engine
+from trackmesh.services.fusion.partition.sensor_plots import SensorPlots
 from trackmesh.services.fusion.picture import TRACK_EPOCH_MS
 from trackmesh.services.fusion.rates import Rates
 from trackmesh.services.fusion.settings import FusionSettings
@@ -43,7 +45,8 @@ class FusionService:
     def __init__(self, runtime: ServiceRuntime, settings: FusionSettings) -> None:
         self.runtime = runtime
         self.settings = settings
-        first = time.time_ns() // 1_000_000 - TRACK_EPOCH_MS
+        self._started_ns = time.time_ns()
+        first = self._started_ns // 1_000_000 - TRACK_EPOCH_MS
         self.unit = Unit(settings.unit_id, settings.unit_number, runtime.boot_id, first)
         self.engine = self._new_engine()
         self.intake = Intake(int(settings.max_age_s * 1e9), int(settings.max_ahead_s * 1e9))
@@ -57,10 +60,13 @@ class FusionService:
         self._answered: Buffer[SensorInfo] = Buffer(_SENSORS_HELD)
         self._tick_due_s = 0.0
         self._inputs: InputFeed | None = None
+        self._partition: PartitionFeed | None = None
         self._keeper = Keeper(settings, runtime.log, runtime.counters.count)
         self._black_box: BlackBox | None = None
 
     def _new_engine(self) -> FusionEngine:
+        if self.settings.partition is not None:
+            return partitioned_engine(self.settings, self.unit, self._started_ns)
         return FusionEngine(self.settings.engine, self.unit, self.settings.origin, self.settings.inputs)
 
     def start(self) -> None:
@@ -89,8 +95,7 @@ class FusionService:
         runtime.on_exit(self._biases.close)
         self._tokens = runtime.closing(runtime.bus.watch_alive(keys.live("*", "*")))
         self._infos = runtime.closing(runtime.bus.subscribe(keys.sensor("*"), history=True))
-        plots = runtime.bus.subscribe(keys.plots("*"), history=True, capacity=_PLOTS_WAITING, fair=True)
-        self._plots = runtime.closing(plots)
+        self._plots = self._subscribe_to_plots()
         self._watch.began_ns = time.time_ns()
         if self.settings.inputs:
             self._inputs = InputFeed(runtime, self.settings)
@@ -101,6 +106,14 @@ class FusionService:
         if self.settings.state_file is not None:
             runtime.spawn("state", lambda: self._keeper.write_states(runtime.stopping))
         runtime.set_state("ready")
+
+    def _subscribe_to_plots(self) -> Subscription | SensorPlots:
+        runtime = self.runtime
+        if self.settings.partition is not None:
+            self._partition = PartitionFeed(runtime, self.settings, self._lock, _PLOTS_WAITING)
+            return self._partition.plots
+        plots = runtime.bus.subscribe(runtime.keys.plots("*"), history=True, capacity=_PLOTS_WAITING, fair=True)
+        return runtime.closing(plots)
 
     def answer(self, query: Query) -> Iterator[tuple[bytes, str]]:
         """Answer a ``TrackQuery`` with one ``TrackFrame``; an empty payload asks for all tracks."""
@@ -130,7 +143,8 @@ class FusionService:
     def _run(self) -> None:
         # Kept tracks must grow old before plots come that could be taken for theirs.
         self._tick_if_due()
-        patience_s = min(self.settings.tick_s, _INPUTS_EVERY_S) if self._inputs else self.settings.tick_s
+        others = self._inputs or self._partition
+        patience_s = min(self.settings.tick_s, _INPUTS_EVERY_S) if others else self.settings.tick_s
         while not self.runtime.stopping.is_set():
             self._drain()
             sample = self._plots.receive(timeout_s=patience_s)
@@ -144,14 +158,16 @@ class FusionService:
             if kind == "sensor" and self._wanted(ident):
                 (self._alive.add if event.alive else self._alive.discard)(ident)
                 self.runtime.log.info("sensor %s %s", ident, "is there" if event.alive else "is gone")
-            elif self._inputs and kind == KIND:
-                self._inputs.note_alive(ident, event.alive)
+            elif kind == KIND and (others := self._inputs or self._partition):
+                others.note_alive(ident, event.alive)
         while (sample := self._infos.receive(timeout_s=0)) is not None:
             self._on_info(sample)
         while (info := self._answered.receive(timeout_s=0)) is not None:
             self._take_info(info)
         for frame in self._inputs.frames() if self._inputs else ():
             self._take_tracks(frame)
+        if self._partition is not None:
+            self._partition.exchange(self.engine)
 
     def _on_info(self, sample: Sample) -> None:
         if not self._wanted(last_chunk(sample.key)):

@@ -36,6 +36,7 @@ from trackmesh.services.fusion.biases import RegistrationRules
 from trackmesh.services.fusion.inputs import InputRules
 from trackmesh.services.fusion.layer import TrackFilters
 from trackmesh.services.fusion.pair_tests import PairTest, TestName, make_test
+from trackmesh.services.fusion.partition.settings import PartitionSettings
 from trackmesh.services.runtime import ServiceSettings, Texts
 
 
@@ -235,6 +236,9 @@ class EngineSettings(BaseModel):
         return (velocity_models(self.q_m2ps3, self.sojourn_s, prior),)
 
 
+_RING_OF_AREA = 16
+
+
 def _ids(names: list[str]) -> list[str]:
     for name in names:
         if not ID_RE.fullmatch(name):
@@ -257,6 +261,7 @@ class FusionSettings(ServiceSettings):
     origin: Geodetic | None = Field(None, description="origin of the system plane; default: the first geodetic site")
     sensors: Ids = Field([], description="take the plots of these sensors only; default: all of the realm")
     inputs: Ids = Field([], description="other units, or trackers, whose tracks are taken as well")
+    partition: PartitionSettings | None = Field(None, description="the area of this unit, where several share a realm")
     engine: EngineSettings = EngineSettings()
     clock: Literal["wall", "data"] = Field(
         "wall", description="wall: plots must be of now; data: time is that of the plots (replayed recordings)"
@@ -280,6 +285,27 @@ class FusionSettings(ServiceSettings):
     registration_file: Path | None = Field(
         None, description="file that keeps the sensors' biases over restarts; read at the start, written every minute"
     )
+
+    @model_validator(mode="after")
+    def _can_be_partitioned(self) -> Self:
+        if self.partition is None:
+            return self
+        if self.inputs:
+            raise ValueError("a unit with an area takes no tracks of other units as inputs")
+        if self.black_box is not None:
+            raise ValueError("a unit with an area keeps no black box: what other units tell it is not recorded yet")
+        if self.engine.filter == "alpha-beta":
+            raise ValueError("the filter alpha-beta remembers no plots: a unit with an area needs another")
+        if self.engine.ring_system < _RING_OF_AREA:
+            raise ValueError(f"engine.ring_system must be {_RING_OF_AREA} at least where a unit has an area")
+        self.partition.place(self.origin)
+        return self
+
+    def band_width_m(self) -> float:
+        """How far beyond its area this unit takes plots."""
+        assert self.partition is not None
+        engine = self.engine
+        return self.partition.width(engine.cycle_s, engine.bias_range_m, float(np.deg2rad(engine.bias_azimuth_deg)))
 
     @field_validator("inputs")
     @classmethod

@@ -107,6 +107,7 @@ def test_registration_is_taken_from_a_neighbour_where_nothing_is_known() -> None
     late = realm.make("unit-2", 1)
     late.alive(frozenset(["unit-1"]))
     message = told.corrections.message("unit-1", "one", 0, 0)
+    late.band(realm.told[-1] if realm.told[-1].unit_id == "unit-1" else realm.told[-2])
     late.neighbour_registration(message)
     for feed in trial.feeds[:3]:
         late.plots(feed.batch)

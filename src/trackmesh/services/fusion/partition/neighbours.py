@@ -14,6 +14,8 @@ from trackmesh.services.fusion.partition.areas import Area, Place, area_of
 
 State = Literal["joining", "active", "standby"]
 
+_MOST_UNITS = 1024
+
 
 class Ourselves(NamedTuple):
     """Who we are among the others: name, number, when we started, what we look after."""
@@ -86,13 +88,15 @@ class Neighbours:
         """Take note of a message; its sender, and whether that changes anybody's area.
 
         Raises:
-            RefusedMessage: ``own_band``, ``old_frame`` or ``same_number``.
+            RefusedMessage: ``own_band``, ``old_frame``, ``too_many_units`` or ``same_number``.
         """
         if told.unit_id == self.us.unit_id:
             raise RefusedMessage("own_band", "This is a band message of this unit itself.")
         old = self._known.get(told.unit_id)
         if old is not None and old.boot_id == told.boot_id and told.seq <= old.seq:
             raise RefusedMessage("old_frame", f"Band message {told.seq} of {told.unit_id} came after {old.seq}.")
+        if old is None and len(self._known) >= _MOST_UNITS:
+            raise RefusedMessage("too_many_units", f"There are {_MOST_UNITS} units already.")
         self._check_number(told)
         new = self._new(told, old)
         self._known[told.unit_id] = new
@@ -125,12 +129,13 @@ class Neighbours:
     def hear_tracks(self, frame: TrackFrame) -> None:
         """Keep the last picture of a unit: it is what others go on from should it die."""
         last = self._tracks.get(frame.unit_id)
-        if frame.unit_id != self.us.unit_id and not (last and last.boot_id == frame.boot_id and frame.seq <= last.seq):
+        again = last is not None and last.boot_id == frame.boot_id and frame.seq <= last.seq
+        if frame.unit_id in self._known and not again:
             self._tracks[frame.unit_id] = frame
 
     def hear_registration(self, told: Registration) -> None:
         """Keep what a unit thinks of its sensors."""
-        if told.unit_id != self.us.unit_id:
+        if told.unit_id in self._known:
             self._registrations[told.unit_id] = told
 
     def pop_tracks(self, unit_id: str) -> TrackFrame | None:
