@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from benchmarks import peer_scenario, trials, units, verdicts
 from benchmarks.trials import Trial
-from benchmarks.units import Death, HardBorder, Link, Run
+from benchmarks.units import Cut, Death, HardBorder, Link, Run
 from trackmesh.protocol.messages import TrackFrame
 from trackmesh.services.fusion.engine import FusionEngine, Unit
 from trackmesh.services.fusion.partition.areas import Place
@@ -37,6 +37,13 @@ BORDER_M, DEEP_M, FROM_S = 20e3, 2e3, 60.0
 HALVES = (Place(np.array([0.0, 5e3])), Place(np.array([40e3, 5e3])))
 CORNER = (Place(np.array([0.0, 25e3])), Place(np.array([40e3, 25e3])), Place(np.array([20e3, -15e3])))
 """Three cells that meet in one point in the middle, (20, 12.5) km."""
+
+RECTANGLES = tuple(
+    Place(corners.mean(axis=0), corners)
+    for corners in (
+        np.array([[east, -60e3], [east + 80e3, -60e3], [east + 80e3, 80e3], [east, 80e3]]) for east in (-60e3, 20e3)
+    )
+)
 
 DEATH_S = 150.0
 
@@ -54,6 +61,7 @@ class Case(NamedTuple):
     kind: type[PartitionedEngine] = PartitionedEngine
     standby: bool = False
     targets: int = 200
+    cut: Cut | None = None
 
 
 def _nominal(seed: int, duration_s: float, n: int) -> Trial:
@@ -102,6 +110,9 @@ CASES: dict[str, Case] = {
     "4 s late": Case("band messages", _nominal, link=Link(0.05, 4.0)),
     "twice": Case("every batch delivered twice", _nominal, times=2),
     "corner": Case("three units that meet in the middle", _nominal, places=CORNER),
+    "polygons": Case("two rectangles instead of Voronoi cells", _nominal, places=RECTANGLES),
+    "cut 20 s": Case("no unit hears the other from 150 to 170 s", _nominal, cut=Cut(DEATH_S, DEATH_S + 20.0)),
+    "polygons, death": Case("the heir takes over the polygon", _nominal, places=RECTANGLES, death=_dead()),
     "death, cold": Case("unit 1 killed at 150 s, its neighbour knows nothing of it", _nominal, death=_dead("cold")),
     "death, band": Case("its neighbour knows the band", _nominal, death=_dead("band")),
     "death": Case("its neighbour goes on from its last picture", _nominal, death=_dead()),
@@ -149,7 +160,7 @@ def several_units(case: Case, trial: Trial, seed: int) -> Run:
         trial, case.places, EngineSettings(), width_m=case.width_m, link=case.link, seed=seed, kind=case.kind,
         standby=case.standby,
     )  # fmt: skip
-    return units.drive(realm, trial, case.death, case.times)
+    return units.drive(realm, trial, case.death, case.times, case.cut)
 
 
 def figures(trial: Trial, shown: Shown) -> Figures:

@@ -49,6 +49,13 @@ class Death(NamedTuple):
     heirs: str = "frames"
 
 
+class Cut(NamedTuple):
+    """For a time no unit hears any other, while all hear the sensors."""
+
+    from_s: float
+    until_s: float
+
+
 @dataclass
 class Member:
     """One unit at work."""
@@ -67,7 +74,7 @@ class Realm:
 
     Attributes:
         told: all band messages.
-        died_with: ids of the tracks that the dead unit told last.
+        died_with: ids of the tracks that the dead unit told last, and nobody else.
     """
 
     units: dict[str, Member]
@@ -77,6 +84,7 @@ class Realm:
     sensors: Sequence[SensorInfo]
     waiting: list[tuple[float, str, BandFrame | TrackFrame | Registration]] = field(default_factory=list)
     told: list[BandFrame] = field(default_factory=list)
+    cut: bool = False
     died_with: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
 
     def tell_alive(self, known: frozenset[str]) -> None:
@@ -128,7 +136,7 @@ class Realm:
 
     def _send(self, sender: Member, t_s: float, message: BandFrame | TrackFrame | Registration) -> None:
         for name in self.units:
-            if name == sender.name:
+            if name == sender.name or self.cut:
                 continue
             if isinstance(message, BandFrame):
                 if self.rng.random() >= self.link.lost:
@@ -203,11 +211,11 @@ class Run(NamedTuple):
     realm: Realm
 
 
-def drive(realm: Realm, trial: Trial, death: Death | None = None, times: int = 1) -> Run:
+def drive(realm: Realm, trial: Trial, death: Death | None = None, times: int = 1, cut: Cut | None = None) -> Run:
     """All batches of a trial through all units; the merged picture after each."""
     shown: Shown = []
     doubles: list[float] = []
-    steps = _steps(death)
+    steps = _steps(death) + _cut_steps(cut)
     for feed in trial.feeds:
         while steps and steps[0][0] <= feed.arrival_s:
             steps.pop(0)[1](realm)
@@ -227,7 +235,9 @@ def _steps(death: Death | None) -> list[tuple[float, Callable[[Realm], None]]]:
 
     def die(realm: Realm) -> None:
         one = realm.units[death.unit]
-        realm.died_with = one.last.track_id if one.last is not None else realm.died_with
+        if one.last is not None:
+            others = [other.last.track_id for other in realm.living() if other is not one and other.last is not None]
+            realm.died_with = np.setdiff1d(one.last.track_id, np.concatenate([np.empty(0, np.int64), *others]))
         one.dead, one.last = True, None
 
     def learn(realm: Realm) -> None:
@@ -246,6 +256,22 @@ def _steps(death: Death | None) -> list[tuple[float, Callable[[Realm], None]]]:
     if death.back_s is not None:
         steps.append((death.back_s, come_back))
     return steps
+
+
+def _cut_steps(cut: Cut | None) -> list[tuple[float, Callable[[Realm], None]]]:
+    if cut is None:
+        return []
+
+    def apart(realm: Realm) -> None:
+        realm.cut, realm.waiting = True, []
+        for member in realm.living():
+            member.engine.alive(frozenset())
+
+    def together(realm: Realm) -> None:
+        realm.cut = False
+        realm.tell_alive(frozenset(one.name for one in realm.living()))
+
+    return [(cut.from_s, apart), (cut.until_s, together)]
 
 
 def _forget(engine: PartitionedEngine) -> None:

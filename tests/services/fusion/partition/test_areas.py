@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trackmesh.services.fusion.partition.areas import EVERYWHERE, Place, area_of, convex, voronoi
+from trackmesh.services.fusion.partition.areas import EVERYWHERE, NOWHERE, Area, Place, area_of, convex, voronoi
 
 coordinates = st.floats(-1e5, 1e5)
 points = st.tuples(coordinates, coordinates)
@@ -70,8 +70,37 @@ def test_the_cell_of_a_dead_unit_falls_to_its_neighbours() -> None:
     np.testing.assert_array_equal(area_of(a, [c]).depth(at) > 0.0, [True, False])
 
 
-def test_the_polygon_of_a_dead_unit_falls_to_the_nearest() -> None:
-    left, middle, right = (Place(at.mean(axis=0), at) for at in (SQUARE + np.array([k * 10e3, 0.0]) for k in range(3)))
-    at = np.array([[12e3, 5e3], [18e3, 5e3], [12e3, 50e3]])
-    np.testing.assert_array_equal(area_of(left, [right], [middle]).depth(at) >= 0.0, [True, False, False])
-    np.testing.assert_array_equal(area_of(right, [left], [middle]).depth(at) >= 0.0, [False, True, False])
+def rectangles(n: int) -> list[Place]:
+    """Side by side from west to east."""
+    return [Place(at.mean(axis=0), at) for at in (SQUARE + np.array([k * 10e3, 0.0]) for k in range(n))]
+
+
+def test_polygons_side_by_side_are_as_deep_as_they_are_far_from_their_border() -> None:
+    left, right = rectangles(2)
+    at = np.array([[7e3, 5e3], [9e3, 5e3], [12e3, 5e3]])
+    np.testing.assert_allclose(area_of(left, [right]).depth(at), [3e3, 1e3, -2e3])
+    np.testing.assert_allclose(area_of(right, [left]).depth(at), [-3e3, -1e3, 2e3])
+
+
+def test_what_lies_in_no_polygon_belongs_to_the_nearest_and_what_lies_in_two_to_the_deeper() -> None:
+    left, _, right = rectangles(3)
+    at = np.array([[12e3, 5e3], [18e3, 5e3], [5e3, -40e3], [25e3, 60e3]])
+    np.testing.assert_array_equal(area_of(left, [right]).depth(at) >= 0.0, [True, False, True, False])
+    np.testing.assert_array_equal(area_of(right, [left]).depth(at) >= 0.0, [False, True, False, True])
+    wide = Place(SQUARE.mean(axis=0), SQUARE * np.array([1.5, 1.0]))
+    inside_both = np.array([[11e3, 5e3], [14e3, 5e3]])
+    middle = rectangles(2)[1]
+    np.testing.assert_array_equal(area_of(wide, [middle]).depth(inside_both) > 0.0, [True, False])
+
+
+@given(st.integers(2, 5), points)
+def test_every_point_belongs_to_one_polygon(n: int, at: tuple[float, float]) -> None:
+    every = rectangles(n)
+    depths = [area_of(one, every[:k] + every[k + 1 :]).depth(np.array([at]))[0] for k, one in enumerate(every)]
+    assert max(depths) > -1e-3
+    assert sum(depth > 1e-3 for depth in depths) <= 1
+
+
+def test_nowhere_is_nowhere_deep() -> None:
+    assert Area(NOWHERE).depth(np.array([[0.0, 0.0], [1e6, 1e6]])).tolist() == [-np.inf, -np.inf]
+    assert not Area(NOWHERE).everywhere and Area(EVERYWHERE).everywhere

@@ -8,6 +8,8 @@ from benchmarks import peer_scenario, scale_out, units
 from benchmarks.scale_out import CASES, Figures, death_of, run_case
 
 from trackmesh.protocol.codec import encode
+from trackmesh.services.fusion import snapshot
+from trackmesh.services.fusion.partition.engine import PartitionedEngine
 from trackmesh.services.fusion.settings import EngineSettings
 
 pytestmark = pytest.mark.skipif(
@@ -39,7 +41,7 @@ def test_without_adoption_identities_end_at_the_border() -> None:
     assert found["switches"] > found["single_switches"] + 40
 
 
-@pytest.mark.parametrize("name", ["4 s late", "50 % lost", "corner"])
+@pytest.mark.parametrize("name", ["4 s late", "50 % lost", "corner", "polygons"])
 def test_identities_survive_what_networks_do(name: str) -> None:
     found = short(name)
     assert found["kept_pct"] >= found["single_kept_pct"]
@@ -87,6 +89,31 @@ def test_a_unit_that_returns_owns_its_area_again_under_the_same_ids() -> None:
     last = run.realm.units["unit-1"].last
     assert last is not None
     assert (last.epoch >= 2).sum() > 10
+
+
+def test_units_that_could_not_hear_each_other_agree_again_on_every_id() -> None:
+    case = CASES["cut 20 s"]._replace(cut=units.Cut(60.0, 80.0))
+    found = run_case(case, 2, SHORT_S, 100)
+    assert found["kept_pct"] >= found["single_kept_pct"]
+    assert found["switches"] <= found["single_switches"] + 4
+    assert found["wrong"] == 0.0
+
+
+def test_a_units_tracks_are_kept_over_its_own_restart_with_their_epochs() -> None:
+    case = CASES["nominal"]
+    trial = case.make(2, 60.0, 50)
+    realm = units.make_realm(trial, scale_out.HALVES, EngineSettings(), seed=2)
+    units.drive(realm, trial)
+    before = realm.units["unit-1"].engine
+    kept = before.snapshot()
+    assert kept is not None
+    after = PartitionedEngine(before.settings, before.unit, before.share)
+    after.restore(snapshot.from_bytes(snapshot.to_bytes(kept)))
+    claims = before.ownership.claims
+    assert (claims.epoch > 0).sum() > 10
+    np.testing.assert_array_equal(after.ownership.epochs(claims.ident), claims.epoch)
+    # Others may own them by now: that they have to hear first.
+    assert not after.ownership.claims.owner.any()
 
 
 def test_ids_of_a_restarted_unit_are_new() -> None:

@@ -31,24 +31,42 @@ class Cell(NamedTuple):
             return np.full(len(points), np.inf)
         return np.asarray((points @ self.normal.T + self.offset).min(axis=1))
 
-    def within(self, other: Cell) -> Cell:
-        """What both have in common."""
-        return Cell(np.concatenate([self.normal, other.normal]), np.concatenate([self.offset, other.offset]))
-
 
 EVERYWHERE = Cell(np.empty((0, 2)), np.empty(0))
+NOWHERE = Cell(np.zeros((1, 2)), np.array([-np.inf]))
+
+
+class Polygon(NamedTuple):
+    """A convex polygon: its corners (k, 2), and the half-planes whose intersection it is."""
+
+    corners: FloatArray
+    cell: Cell
+
+    def depth(self, points: FloatArray) -> FloatArray:
+        """Signed distances (n,) of points (n, 2) to its edge, positive inside."""
+        depth = self.cell.depth(points)
+        outside = depth < 0.0
+        depth[outside] = -_distance(points[outside], self.corners)
+        return depth
 
 
 class Area(NamedTuple):
-    """A union of cells; without any it is nowhere."""
+    """What is deeper in one cell than in any of the others; all of the cell where there are no others."""
 
-    cells: tuple[Cell, ...]
+    cell: Cell | Polygon
+    others: tuple[Cell | Polygon, ...] = ()
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether it is the whole plane."""
+        return isinstance(self.cell, Cell) and not len(self.cell.offset)
 
     def depth(self, points: FloatArray) -> FloatArray:
-        """Signed depths (n,) of points (n, 2): that of the cell in which each is deepest."""
-        if not self.cells:
-            return np.full(len(points), -np.inf)
-        return np.asarray(np.maximum.reduce([cell.depth(points) for cell in self.cells]))
+        """Signed depths (n,) of points (n, 2): half of what they are deeper in this cell than in any other."""
+        if not self.others:
+            return self.cell.depth(points)
+        deepest = np.maximum.reduce([cell.depth(points) for cell in self.others])
+        return np.asarray(0.5 * (self.cell.depth(points) - deepest))
 
 
 class Place(NamedTuple):
@@ -86,7 +104,7 @@ def voronoi(centre: FloatArray, others: Sequence[FloatArray]) -> Cell:
     return Cell(normal, -np.einsum("ij,ij->i", normal, middle))
 
 
-def convex(corners: FloatArray) -> Cell:
+def convex(corners: FloatArray) -> Polygon:
     """A convex polygon by its corners (k, 2), in either direction.
 
     Raises:
@@ -104,17 +122,33 @@ def convex(corners: FloatArray) -> Cell:
         raise ValueError("a polygon must go round once")
     left = np.sign(turn[0])
     normal = left * np.stack([-step[:, 1], step[:, 0]], axis=1) / length[:, None]
-    return Cell(normal, -np.einsum("ij,ij->i", normal, corners))
+    return Polygon(corners, Cell(normal, -np.einsum("ij,ij->i", normal, corners)))
 
 
-def area_of(place: Place, alive: Sequence[Place], dead: Sequence[Place] = ()) -> Area:
-    """What belongs to a unit while the units at the places ``alive`` (without itself) are there.
+def _distance(points: FloatArray, corners: FloatArray) -> FloatArray:
+    """Distances (n,) of points (n, 2) to the nearest edge between corners (k, 2)."""
+    edge = np.roll(corners, -1, axis=0) - corners
+    off = points[:, None] - corners
+    along = np.clip((off * edge).sum(axis=2) / (edge * edge).sum(axis=1), 0.0, 1.0)
+    left = off - along[:, :, None] * edge
+    return np.asarray(np.hypot(left[:, :, 0], left[:, :, 1]).min(axis=1))
 
-    Its own polygon, or its Voronoi cell among the alive; and of the polygons of ``dead`` units the part that is
-    nearest to its centre. Voronoi cells of dead units fall to their neighbours by themselves. A Voronoi unit among
-    polygons leaves them out of its cell only by the distance to their centres.
+
+def area_of(place: Place, owners: Sequence[Place]) -> Area:
+    """What belongs to a unit while those at the places ``owners`` (without itself) own areas too.
+
+    Without others it is everything. Voronoi cells fill the plane by themselves. Of polygons, what lies in none, as that
+    of a unit which is gone, belongs to the nearest one, and what lies in several to the one in which it is deepest.
     """
-    nearest = voronoi(place.centre_m, [one.centre_m for one in alive])
-    own = nearest if place.polygon_m is None else convex(place.polygon_m)
-    inherited = [convex(one.polygon_m).within(nearest) for one in dead if one.polygon_m is not None]
-    return Area((own, *inherited))
+    if not owners:
+        return Area(EVERYWHERE)
+    every = [place, *owners]
+    cells = [_cell(one, every[:k] + every[k + 1 :]) for k, one in enumerate(every)]
+    polygons = any(one.polygon_m is not None for one in every)
+    return Area(cells[0], tuple(cells[1:]) if polygons else ())
+
+
+def _cell(place: Place, others: Sequence[Place]) -> Cell | Polygon:
+    if place.polygon_m is not None:
+        return convex(place.polygon_m)
+    return voronoi(place.centre_m, [one.centre_m for one in others])

@@ -64,7 +64,7 @@ class PartitionedEngine(FusionEngine):
         self.ownership = Ownership(unit.number, self._picture.numbers, cycle_ns)
         self._stitching.ours = self.ownership.owned
         self._priors = Priors(self.corrections, self.counters)
-        self._area = Area((EVERYWHERE,))
+        self._area = Area(EVERYWHERE)
         self._alive: frozenset[str] = frozenset()
         self._heard_others_s: float | None = None
         self._cycles = self._band_seq = 0
@@ -171,8 +171,7 @@ class PartitionedEngine(FusionEngine):
             self._cycle_if_due()
 
     def _limit(self, sensor: Sensor) -> None:
-        everywhere = any(not len(cell.offset) for cell in self._area.cells)
-        within = None if everywhere else self._within
+        within = None if self._area.everywhere else self._within
         for clutter in (sensor.local_clutter, sensor.system_clutter):
             clutter.limit(within)
 
@@ -354,5 +353,4 @@ class PartitionedEngine(FusionEngine):
         super()._restore(kept)
         ours = under("partition", kept.arrays)
         if ours:
-            self.ownership.known(ours["ident"])
-            self.ownership.claims.epoch[:] = ours["epoch"]
+            self.ownership.restore(ours["ident"], ours["epoch"])

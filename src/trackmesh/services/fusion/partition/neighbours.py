@@ -10,7 +10,7 @@ import numpy as np
 
 from trackmesh.protocol.errors import RefusedMessage
 from trackmesh.protocol.messages import BandFrame, Registration, TrackFrame, UnitArea
-from trackmesh.services.fusion.partition.areas import Area, Place, area_of
+from trackmesh.services.fusion.partition.areas import NOWHERE, Area, Place, area_of
 
 State = Literal["joining", "active", "standby"]
 
@@ -175,7 +175,7 @@ class Neighbours:
     def area(self) -> Area:
         """What is ours, or will be once we own it."""
         owners = [one.place for one in self.owners() if not one.place.same(self.us.place)]
-        return area_of(self.us.place, owners, self._dead(owners))
+        return area_of(self.us.place, owners)
 
     def area_with_joining(self) -> Area | None:
         """What will be ours once those who are joining own areas; None where nobody is, or stands by for us."""
@@ -183,16 +183,11 @@ class Neighbours:
         joining = [one.place for one in alive if one.state == "joining" and one.index not in self._founders]
         heirs = any(one.state == "standby" for one in alive)
         if heirs or any(place.same(self.us.place) for place in joining):
-            return Area(())
+            return Area(NOWHERE)
         if not joining:
             return None
-        owners = [one.place for one in self.owners()] + joining
-        return area_of(self.us.place, owners, self._dead(owners))
-
-    def _dead(self, owners: list[Place]) -> list[Place]:
-        gone = [one.place for one in self._known.values() if not one.alive and one.place.polygon_m is not None]
-        held = [*owners, self.us.place]
-        return [place for place in gone if not any(place.same(other) for other in held)]
+        owners = [one.place for one in self.owners() if not one.place.same(self.us.place)] + joining
+        return area_of(self.us.place, owners)
 
     def indices(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
         """Numbers (n,) of the units that own areas."""

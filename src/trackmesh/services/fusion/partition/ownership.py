@@ -115,6 +115,11 @@ class Ownership:
         if len(new):
             self.claims = self.claims.join(_new(np.unique(new), self.cycle))
 
+    def restore(self, ident: IntArray, epoch: IntArray) -> None:
+        """Know these tracks and how far their epochs had come; whose they are by now has to be heard first."""
+        self.claims = _new(ident, self.cycle)
+        self.claims.epoch[:] = epoch
+
     def inherit(self, ident: IntArray, epoch: IntArray) -> None:
         """Own tracks of a unit that is gone, in epochs after theirs."""
         self.claims = self.claims.take(~np.isin(self.claims.ident, ident))
