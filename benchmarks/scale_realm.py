@@ -107,14 +107,15 @@ def make_world(columns: int, rows: int, side_m: float, sensors: int, targets: in
     rng = np.random.default_rng(seed)
     size_m = np.array([columns, rows]) * side_m
     # Sensors in a grid as square as can be.
-    wide = max(1, round(np.sqrt(sensors * size_m[0] / size_m[1])))
-    high = -(-sensors // wide)
+    fitting = [k for k in range(1, sensors + 1) if sensors % k == 0]
+    wide = min(fitting, key=lambda k: abs(np.log(k * k / sensors * size_m[1] / size_m[0])))
+    high = sensors // wide
     grid = np.stack(np.meshgrid((np.arange(wide) + 0.5) / wide, (np.arange(high) + 0.5) / high), axis=-1).reshape(-1, 2)
     course, speed = rng.uniform(0.0, 2.0 * np.pi, targets), rng.uniform(80.0, 250.0, targets)
     return World(
         size_m, rng.uniform(0.0, 1.0, (targets, 2)) * size_m,
         speed[:, None] * np.stack([np.sin(course), np.cos(course)], axis=1),
-        grid[:sensors] * size_m, float(np.sqrt(SEEN_BY * size_m.prod() / (np.pi * sensors))),
+        grid * size_m, float(np.sqrt(SEEN_BY * size_m.prod() / (np.pi * sensors))),
     )  # fmt: skip
 
 
@@ -267,8 +268,8 @@ def _costs(
         batch_s = np.array(member.batch_s) if member.batch_s else np.zeros(1)
         rows.append(
             {
-                "tracks": figures["tracks"],
-                "owned": figures["tracks_owned"],
+                "tracks": figures["tracks"] + figures["shadows"],
+                "owned": figures["tracks"],
                 "sensors": float(len(engine.sensors)),
                 "plots_heard_per_s": member.heard / counted_s,
                 "core_share": (member.engine_s + member.codec_s + member.band_s) / counted_s,
@@ -332,7 +333,7 @@ def main() -> None:
     if given.plot:
         from benchmarks.scale_realm_chart import draw
 
-        draw(costs.units, costs.places, given.plot)
+        draw(costs.units, costs.places, given.side_km, given.plot)
 
 
 if __name__ == "__main__":

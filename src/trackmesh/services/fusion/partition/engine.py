@@ -43,6 +43,7 @@ BoolArray = npt.NDArray[np.bool_]
 
 _SEED_SCORE = 20.0
 _JOIN_CYCLES = 2
+_LATE = 1.5
 
 
 class PartitionedEngine(FusionEngine):
@@ -99,7 +100,9 @@ class PartitionedEngine(FusionEngine):
         self.counters["band_messages"] += 1
         if changed:
             self._new_area()
-        if one.alive:
+        # What others share with others is far from here; a late message tells where its tracks were.
+        near = self._area.depth(told.state[:, :2].astype(np.float64)) > -_LATE * self.share.width_m
+        if one.alive and near.any():
             self._adopt(told, one)
 
     def neighbour_tracks(self, frame: TrackFrame) -> None:
@@ -139,11 +142,13 @@ class PartitionedEngine(FusionEngine):
         return frame.model_copy(update={name: getattr(frame, name)[ours] for name in names}) if ours.any() else None
 
     def figures(self) -> dict[str, float]:
-        """As of any engine, and how many tracks are ours, how many units own an area."""
+        """As of any engine; ``tracks`` are ours, ``shadows`` those of others, ``units_active`` who owns areas."""
+        of_all = super().figures()
         owners = len(self.neighbours.owners()) + self.neighbours.owning()
-        owned = int(self.ownership.claims.owner.sum())
-        return super().figures() | {
-            "tracks_owned": float(owned),
+        owned = float(self.ownership.owned(self._system.life.link[self._confirmed()]).sum())
+        return of_all | {
+            "tracks": owned,
+            "shadows": of_all["tracks"] - owned,
             "units_active": float(owners),
             "owning": float(self.neighbours.owning()),
             "band_width_m": self.share.width_m,

@@ -66,6 +66,7 @@ class PartitionFeed:
         self._changed_s = -1e18
         self._told_alive = False
         self._follow_due_s = 0.0
+        self._owned, self._inherited = False, 0
         keys, bus = runtime.keys, runtime.bus
         self._publisher = bus.publisher(keys.band(settings.unit_id), history=1)
         runtime.on_exit(self._publisher.close)
@@ -98,6 +99,15 @@ class PartitionFeed:
         if told is not None:
             self._publisher.put(encode(told), encoding(told))
         self._follow(engine)
+        self._log(engine)
+
+    def _log(self, engine: PartitionedEngine) -> None:
+        log, owning, inherited = self._runtime.log, engine.neighbours.owning(), engine.counters["inherited"]
+        if owning != self._owned:
+            log.info("the area is %s", "ours" if owning else "no longer ours")
+        if inherited != self._inherited:
+            log.info("going on with %d tracks of a unit that is gone", inherited - self._inherited)
+        self._owned, self._inherited = owning, inherited
 
     def _tell_alive(self, engine: PartitionedEngine) -> None:
         """Others are gone only if we are still there ourselves: else it is we who are cut off."""
