@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from trackmesh.protocol.fair_buffer import FairBuffer
 from trackmesh.protocol.bus import Sample, Subscription
+from trackmesh.protocol.fair_buffer import FairBuffer
 from trackmesh.services.runtime import ServiceRuntime
 
 
