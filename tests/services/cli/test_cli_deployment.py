@@ -52,6 +52,15 @@ def test_a_participant_that_comes_later(here: Path, run: Run) -> None:
     assert (here / "certs/sensor.north.pem").read_bytes() == before
 
 
+def test_a_router_that_is_reached_elsewhere_now(here: Path, run: Run) -> None:
+    run("certs", "init")
+    run("certs", "issue", "--deployment", "deployment.toml")
+    assert run("certs", "issue", "--deployment", "deployment.toml").stderr == ""
+    (here / "deployment.toml").write_text(_PLAN.replace('"localhost"', '"elsewhere"'))
+    told = run("certs", "issue", "--deployment", "deployment.toml").stderr
+    assert "router.main.pem is for other hosts than deployment.toml says" in told
+
+
 def test_what_ends_soon_is_an_exit_code(here: Path, run: Run) -> None:
     run("certs", "init")
     run("certs", "issue", "sensor", "north", "--days", 20)

@@ -60,10 +60,13 @@ def certs_issue(
     folder: Folder = _CERTS,
 ) -> None:
     """Issue a key and a certificate, for one or for a whole deployment."""
-    from trackmesh.services.deployment.authority import issue
+    from trackmesh.services.deployment.authority import issue, read_certificate
 
     for who, hosts in _wanted(role, name, host or [], deployment):
-        if deployment is not None and not renew and (folder / f"{who.common_name}.pem").exists():
+        there = folder / f"{who.common_name}.pem"
+        if deployment is not None and not renew and there.exists():
+            if set(read_certificate(there).hosts) != set(hosts):
+                say(f"{there} is for other hosts than {deployment} says; issue it again, with --renew")
             continue
         made = issue(folder, who, hosts, days, renew=renew)
         say(f"{made.path} until {made.ends:%Y-%m-%d}")
