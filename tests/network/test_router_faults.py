@@ -132,6 +132,21 @@ def test_a_last_message_lost_in_an_outage_arrives_without_another(own_router: Ro
         assert sample is not None and sample.payload == b"during"
 
 
+def test_who_has_heard_only_what_was_before_gets_what_an_outage_withheld(
+    own_router: RouterProcess, bus: ZenohBus
+) -> None:
+    with ZenohBus.open([own_router.endpoint], timeout_s=10.0) as sensor:
+        publisher = sensor.publisher(PLOTS, history=2)
+        publisher.put(b"before", "")
+        subscription = bus.subscribe(PLOTS, history=True)
+        assert subscription.receive(5.0)
+        own_router.process.kill()
+        publisher.put(b"during", "")
+        own_router.restart()
+        sample = subscription.receive(10.0)
+        assert sample is not None and sample.payload == b"during"
+
+
 def test_a_frozen_router_loses_nothing_of_what_is_kept(
     processes: Processes, own_router: RouterProcess, bus: ZenohBus
 ) -> None:

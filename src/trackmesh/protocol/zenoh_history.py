@@ -111,8 +111,19 @@ class _Merge:
         """A publisher is there: ``{key}/@adv/pub/{zid}/{eid}/_``; this is also where its cache answers."""
         cache = str(token.key_expr)
         zid, eid = cache.split("/")[-3:-1]
-        if token.kind == zenoh.SampleKind.PUT and eid.isdigit():
-            self._stream((zid, int(eid)), cache)
+        if token.kind != zenoh.SampleKind.PUT or not eid.isdigit():
+            return
+        source = (zid, int(eid))
+        with self._lock:
+            stream = self._streams.get(source)
+            idle = stream is not None and stream.held is None
+            if stream is not None and idle:
+                stream.held, stream.attempts = [], 0
+        if stream is None:
+            self._stream(source, cache)
+        elif idle:
+            # It was out of reach. The library itself asks only those of whom it has heard something live.
+            self._fetch(stream)
 
     def on_sample(self, sample: zenoh.Sample) -> None:
         """A sample came live, or was recovered by the library."""
