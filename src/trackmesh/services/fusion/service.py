@@ -200,13 +200,7 @@ class FusionService:
             return
         now_ns, now_s = time.time_ns(), time.monotonic()
         try:
-            # Before it is decoded: who floods must cost nothing.
-            if self._of_now and not self._rates.message(sensor_id, now_s):
-                raise RefusedMessage("too_fast", f"Sensor {sensor_id} sends more batches than it may.")
-            batch = decode(sample.payload, PlotBatch, sample.encoding, self.settings.max_batch_bytes)
-            if batch.sensor_id != sensor_id:
-                raise RefusedMessage("wrong_sensor", f"{sample.key} brought plots of {batch.sensor_id}.")
-            self._check_room(sensor_id)
+            batch = self._read_batch(sensor_id, sample, now_s)
             self._note_heard(batch, now_ns)
             if self._of_now and not self._rates.plots(sensor_id, len(batch.t_ns), now_s):
                 raise RefusedMessage("too_fast", f"Sensor {sensor_id} sends more plots than it may.")
@@ -219,6 +213,16 @@ class FusionService:
             self._take_batch(batch)
         else:
             self._hold(batch)
+
+    def _read_batch(self, sensor_id: str, sample: Sample, now_s: float) -> PlotBatch:
+        # Before it is decoded: who floods must cost nothing.
+        if self._of_now and not self._rates.message(sensor_id, now_s):
+            raise RefusedMessage("too_fast", f"Sensor {sensor_id} sends more batches than it may.")
+        batch = decode(sample.payload, PlotBatch, sample.encoding, self.settings.max_batch_bytes)
+        if batch.sensor_id != sensor_id:
+            raise RefusedMessage("wrong_sensor", f"{sample.key} brought plots of {batch.sensor_id}.")
+        self._check_room(sensor_id)
+        return batch
 
     def _note_heard(self, batch: PlotBatch, now_ns: int) -> None:
         sectors = batch.scan.sectors if batch.scan is not None else 1
