@@ -76,6 +76,19 @@ def test_clocks_are_told_beyond_their_limits_only() -> None:
         assert words in told and bool(words) == bool(told), (ahead_s, told)
 
 
+def test_of_sensors_that_are_not_followed_nothing_is_expected() -> None:
+    one = watch()
+    for name in "ab":
+        one.expect(name, 1.0, AT)
+    one.follow(frozenset("a"), AT)
+    assert list(one.notices(set("ab"), AT + 5 * S)) == ["silent a"]
+    assert one.silent_since_ns("b", AT + 5 * S) is None
+    # From when it is followed on it is given its time.
+    one.follow(frozenset("b"), AT + 60 * S)
+    assert one.notices(set("ab"), AT + 61 * S) == {}
+    assert list(one.notices(set("ab"), AT + 65 * S)) == ["silent b"]
+
+
 def test_where_there_are_no_tokens_none_are_missed() -> None:
     one = SensorWatch(Limits(0.25, 100.0), True, word="network")
     one.expect("hall", 1.5, AT)

@@ -56,6 +56,7 @@ class SensorWatch:
     began_ns: int = 0
     word: str = "sensor"
     _watched: dict[str, _Watched] = field(default_factory=dict)
+    _followed: frozenset[str] | None = None
 
     def expect(self, sensor_id: str, period_s: float, now_ns: int) -> None:
         """A sensor has said that it looks around every ``period_s``."""
@@ -65,6 +66,13 @@ class SensorWatch:
             self._watched[sensor_id] = _Watched(clock, period_s, period_s, now_ns, now_ns)
         else:
             one.period_s = period_s
+
+    def follow(self, sensors: frozenset[str], now_ns: int) -> None:
+        """Only of these anything is to come from now on; without this, of all."""
+        for name in sensors - (self._followed if self._followed is not None else frozenset()):
+            if (one := self._watched.get(name)) is not None:
+                one.heard_ns = one.taken_ns = max(now_ns, one.heard_ns)
+        self._followed = sensors
 
     def heard(self, sensor_id: str, newest_ns: int | None, sectors: int, now_ns: int) -> None:
         """A batch came, whether or not it is taken; ``newest_ns`` is the time of its last plot."""
@@ -93,7 +101,9 @@ class SensorWatch:
     def silent_since_ns(self, sensor_id: str, now_ns: int) -> int | None:
         """When the last batch came of a sensor that should have sent more since; None: it is on time."""
         one = self._watched.get(sensor_id)
-        return None if one is None or not _overdue(one, one.heard_ns, now_ns) else one.heard_ns
+        if one is None or not self._follows(sensor_id) or not _overdue(one, one.heard_ns, now_ns):
+            return None
+        return one.heard_ns
 
     def notices(self, alive: Iterable[str] | None, now_ns: int) -> dict[str, str]:
         """What is wrong now: a sentence each, by a name that stays while it lasts.
@@ -104,11 +114,14 @@ class SensorWatch:
         """
         return self._silences(None if alive is None else set(alive), now_ns) | self._refusals(now_ns) | self._clocks()
 
+    def _follows(self, sensor_id: str) -> bool:
+        return self._followed is None or sensor_id in self._followed
+
     def _silences(self, alive: set[str] | None, now_ns: int) -> dict[str, str]:
         silent = {
             name: one.heard_ns
             for name, one in self._watched.items()
-            if _overdue(one, one.heard_ns, now_ns) and now_ns - one.heard_ns < TOLD_S * 1e9
+            if self._follows(name) and _overdue(one, one.heard_ns, now_ns) and now_ns - one.heard_ns < TOLD_S * 1e9
         }
         if now_ns - self.began_ns > SILENT_S * 1e9:
             silent |= {name: self.began_ns for name in self.named if name not in self._watched}

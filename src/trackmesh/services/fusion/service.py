@@ -131,6 +131,8 @@ class FusionService:
         with self._lock:
             figures = self.engine.figures()
             counters = dict(self.engine.counters)
+            if isinstance(self._plots, SensorPlots):
+                self._watch.follow(self._plots.sensors, time.time_ns())
             notices = self._watch.notices(self._alive, time.time_ns())
             sensors = [self._sensor_health(sensor_id) for sensor_id in sorted(self.intake.streams)]
             sensors += self._inputs.health(self.engine.inputs) if self._inputs else []
