@@ -27,7 +27,7 @@ def draw(rows: Rows, path: Path) -> None:
     from matplotlib import pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 5.2), layout="constrained")
-    names = list(dict.fromkeys(str(row["case"]) for row in rows if not str(row["case"]).startswith("death")))
+    names = list(dict.fromkeys(str(row["case"]) for row in rows if "death" not in str(row["case"])))
     place = np.arange(len(names))[::-1]
     left.barh(
         place + 0.2, [_mean(rows, name, "single_kept_pct") for name in names], 0.36, color="0.8", label="one engine"
@@ -39,11 +39,12 @@ def draw(rows: Rows, path: Path) -> None:
     left.set(xlabel="targets that cross the border and keep their id, %", xlim=(0, 104))
     left.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
     for colour, (name, label) in zip(("tab:blue", "tab:green", "tab:orange", "tab:red"), _DEATHS.items(), strict=True):
-        if not any(row["case"] == name for row in rows):
-            continue
-        shown, ids = ([_mean(rows, name, f"{what}_{s}_pct") for s in _LATER_S] for what in ("shown", "ids"))
-        right.plot(_LATER_S, ids, "o-", color=colour, label=f"{label}: same id")
-        right.plot(_LATER_S, shown, "--", color=colour, alpha=0.6, label=f"{label}: shown")
+        if any(row["case"] == name for row in rows):
+            style = "o-" if name != "death, standby" else "s--"
+            ids = [_mean(rows, name, f"ids_{s}_pct") for s in _LATER_S]
+            right.plot(_LATER_S, ids, style, color=colour, label=f"same id: {label}")
+    shown = [_mean(rows, "death, cold", f"shown_{s}_pct") for s in _LATER_S]
+    right.plot(_LATER_S, shown, ":", color="0.4", label="shown under any id: cold, or band only")
     right.set(xlabel="seconds after a unit was killed (noticed after 2 s)", ylabel="of the targets that it showed, %")
     right.set(ylim=(-3, 104), xlim=(0, 62))
     right.legend(loc="center right", frameon=False, fontsize=8)

@@ -24,12 +24,11 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.peer_scenario import START_NS
-from benchmarks.trials import FloatArray
+from benchmarks.trials import FloatArray, IntArray
 from trackmesh.protocol.codec import decode, encode, encoding
 from trackmesh.protocol.errors import RefusedMessage
 from trackmesh.protocol.merging import without_doubles
 from trackmesh.protocol.messages import BandFrame, PlotBatch, ScanPart, SensorInfo, TrackFrame
-from trackmesh.services.fusion import frames
 from trackmesh.services.fusion.engine import Unit
 from trackmesh.services.fusion.partition.areas import Place
 from trackmesh.services.fusion.partition.band import Share
@@ -238,25 +237,23 @@ def _tell(members: dict[str, Member], name: str, told: BandFrame, counted: bool)
             member.band_s += time.process_time() - began
 
 
-def _picture(members: dict[str, Member]) -> TrackFrame:
+def _picture(members: dict[str, Member], t_s: float) -> tuple[IntArray, FloatArray]:
+    """Ids (n,) and positions (n, 2) at a time; frames are up to a second old, each of its own time."""
     last = without_doubles([one.last for one in members.values() if one.last is not None])
-    bare = [
-        one.model_copy(update={"sensors": [], "members": np.empty((len(one.track_id), 0), np.int64)}) for one in last
-    ]
-    return frames.join(bare[0], bare[1:])
+    age_s = [t_s - (one.t_ns - START_NS) / 1e9 for one in last]
+    place = [one.state[:, :2] + age * one.state[:, 2:4] for one, age in zip(last, age_s, strict=True)]
+    return np.concatenate([one.track_id for one in last]), np.concatenate(place)
 
 
-def _score(world: World, t_s: float, members: dict[str, Member]) -> tuple[tuple[int, int, int, int], Any, int]:
-    picture = _picture(members)
-    # Frames are up to a second old: tracks are compared with where targets were then.
-    state = picture.state[:, :2] + (START_NS / 1e9 + t_s - picture.t_ns / 1e9) * picture.state[:, 2:4]
+def _score(world: World, t_s: float, members: dict[str, Member]) -> tuple[tuple[int, int, int, int], IntArray, int]:
+    ident, state = _picture(members, t_s)
     best = match(world.at(t_s), state, CUT_OFF_M)
     followed = np.full(len(world.start), -1)
-    followed[best.target] = picture.track_id[best.track]
+    followed[best.target] = ident[best.track]
     missed = int((followed[world.covered(t_s)] < 0).sum())
     told = sum(len(one.last.track_id) for one in members.values() if one.last is not None)
     parts = best.gospa()
-    return (len(picture.track_id), missed, parts.false, len(best.track)), followed, told - len(picture.track_id)
+    return (len(ident), missed, parts.false, len(best.track)), followed, told - len(ident)
 
 
 def _costs(

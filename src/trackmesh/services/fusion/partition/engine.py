@@ -66,7 +66,7 @@ class PartitionedEngine(FusionEngine):
         self._stitching.ours = self.ownership.owned
         self._priors = Priors(self.corrections, self.counters)
         self._area = Area(EVERYWHERE)
-        self._alive: frozenset[str] = frozenset()
+        self._alive: frozenset[str] | None = None
         self._heard_others_s: float | None = None
         self._cycles = self._band_seq = 0
         self._band: BandFrame | None = None
@@ -77,6 +77,8 @@ class PartitionedEngine(FusionEngine):
         """Which other units are alive: go on with the tracks of those that are gone, as far as they are ours now."""
         if units == self._alive:
             return
+        if self._alive is None:
+            self._cycles = 0
         self._alive = units
         gone = self.neighbours.now_alive(units)
         self._new_area()
@@ -208,7 +210,7 @@ class PartitionedEngine(FusionEngine):
 
     def _join(self) -> None:
         """Own the area once our tracks are those of the units that looked after it, or at once where none did."""
-        if self.neighbours.state != "joining" or self._cycles <= _JOIN_CYCLES:
+        if self.neighbours.state != "joining" or self._alive is None or self._cycles <= _JOIN_CYCLES:
             return
         if self._heard_others_s is None:
             self._heard_others_s = self._time.now_s

@@ -22,8 +22,10 @@ from trackmesh.services.runtime import ServiceRuntime
 M = TypeVar("M", BandFrame, TrackFrame, Registration)
 
 _WAITING = 256
-_SURE_S = 0.3
-"""Who loses the network hears all units go, itself among them: so long it waits for the news of itself."""
+_SURE_S, _BACK_S = 0.3, 2.0
+"""Who loses the network hears all units go, itself among them: so long it waits for the news of itself; and for that of
+others when it is back, for they may need a moment more.
+"""
 
 _FOLLOW_EVERY_S = 0.5
 
@@ -63,7 +65,7 @@ class PartitionFeed:
         self._sensors = frozenset(settings.sensors)
         self._lock = lock
         self._alive: set[str] = set()
-        self._changed_s = -1e18
+        self._changed_s = self._here_s = -1e18
         self._told_alive = False
         self._follow_due_s = 0.0
         self._owned, self._inherited = False, 0
@@ -80,6 +82,8 @@ class PartitionFeed:
         (self._alive.add if alive else self._alive.discard)(unit)
         self._changed_s = time.monotonic()
         self._told_alive = False
+        if unit == self._unit_id:
+            self._here_s = self._changed_s
         if unit != self._unit_id:
             self._runtime.log.info("unit %s %s", unit, "is there" if alive else "is gone")
 
@@ -111,7 +115,9 @@ class PartitionFeed:
 
     def _tell_alive(self, engine: PartitionedEngine) -> None:
         """Others are gone only if we are still there ourselves: else it is we who are cut off."""
-        if self._told_alive or self._unit_id not in self._alive or time.monotonic() - self._changed_s < _SURE_S:
+        now_s = time.monotonic()
+        sure = now_s - self._changed_s >= _SURE_S and now_s - self._here_s >= _BACK_S
+        if self._told_alive or self._unit_id not in self._alive or not sure:
             return
         self._told_alive = True
         with self._lock:
