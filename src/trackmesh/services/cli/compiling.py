@@ -16,10 +16,12 @@ def compile_() -> None:
 
 
 def _fusion() -> None:
+    from trackmesh.services.fusion.partition import warm_up as partition
     from trackmesh.services.fusion.settings import EngineSettings
     from trackmesh.services.fusion.warm_up import warm_up
 
     warm_up(EngineSettings(), inputs=True)
+    partition.warm_up(EngineSettings())
 
 
 def _tags() -> None:

@@ -22,6 +22,7 @@ from trackmesh.services.fusion.intake import Intake
 from trackmesh.services.fusion.keeping import Keeper
 from trackmesh.services.fusion.partition.feed import PartitionFeed, partitioned_engine
 from trackmesh.services.fusion.partition.sensor_plots import SensorPlots
+from trackmesh.services.fusion.partition.warm_up import warm_up as warm_up_partition
 from trackmesh.services.fusion.picture import TRACK_EPOCH_MS
 from trackmesh.services.fusion.rates import Rates
 from trackmesh.services.fusion.settings import FusionSettings
@@ -83,6 +84,8 @@ class FusionService:
         runtime.set_state("compiling")
         started = time.monotonic()
         warm_up(self.settings.engine, inputs=bool(self.settings.inputs))
+        if self.settings.partition is not None:
+            warm_up_partition(self.settings.engine)
         runtime.log.info("kernels ready after %.1f s", time.monotonic() - started)
         self._frames = runtime.bus.publisher(keys.tracks(self.unit.unit_id), history=_FRAMES_KEPT)
         self._refined = runtime.bus.publisher(keys.refined(self.unit.unit_id), history=_FRAMES_KEPT)
@@ -136,6 +139,8 @@ class FusionService:
             notices = self._watch.notices(self._alive, time.time_ns())
             sensors = [self._sensor_health(sensor_id) for sensor_id in sorted(self.intake.streams)]
             sensors += self._inputs.health(self.engine.inputs) if self._inputs else []
+        if self._partition is not None:
+            notices = self._partition.of_ours(notices)
         figures |= {f"engine.{name}": float(value) for name, value in counters.items()}
         figures["batches_dropped_here"] = float(self._plots.dropped)
         return Health(figures, sensors, notices)
