@@ -1,6 +1,6 @@
 """Two units that share a realm over Zenoh, each a process; one is killed, the other goes on under the same ids.
 
-Radars turn in a second and the neighbour is looked at 20 s after the death; ``TRACKMESH_AFTER_S=60`` looks later.
+Radars turn in a second and the neighbour is looked at 12 s after the death; ``TRACKMESH_AFTER_S=60`` looks later.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from tests.network.realm import READY_S, Realm, next_where
 
 from trackmesh.protocol.client import Client, TrackPicture
 from trackmesh.protocol.keys import last_chunk
-from trackmesh.protocol.messages import TrackFrame
+from trackmesh.protocol.messages import CONFIRMED, TrackFrame
 from trackmesh.protocol.zenoh_bus import ZenohBus
 
 pytestmark = pytest.mark.process
 
-AFTER_S = float(os.environ.get("TRACKMESH_AFTER_S", "20"))
+AFTER_S = float(os.environ.get("TRACKMESH_AFTER_S", "12"))
 TARGETS = 40
 
 _RADAR = """
@@ -122,7 +122,8 @@ def test_a_killed_units_tracks_go_on_under_their_ids(
 
         wait_until(bridged, "time passes", AFTER_S + 30.0)
         heir = tracks_of(client, "east")
-        kept = np.isin(dead.track_id, heir.track_id)
+        # A track that only coasts is none that goes on.
+        kept = np.isin(dead.track_id, heir.track_id[heir.status == CONFIRMED])
         print(f"{kept.sum()} of {len(kept)} ids kept after {AFTER_S:g} s, at least {least} of {TARGETS} shown")
         assert kept.mean() >= 0.96
         # They are on the same targets: all fly straight on.
