@@ -161,6 +161,23 @@ def test_of_a_late_message_nothing_is_concluded_from_plots_that_are_not_common()
         assert hear(one, held(THEIRS), told(held(THEIRS, keys=1), epoch=2, t_ns=NOW_NS - 2 * CYCLE_NS)) == [THEIRS]
 
 
+@pytest.mark.parametrize(("ours_s", "theirs_s", "owns", "epoch"), [(0, -9, True, 6), (-9, 0, False, 5)])
+def test_of_two_owners_the_one_that_still_has_plots_goes_on(ours_s: int, theirs_s: int, owns: bool, epoch: int) -> None:
+    # A unit was taken for dead for a moment: its neighbour went on with its tracks, which it cannot see.
+    one = unit(THEIRS, owner=True, epoch=1)
+    theirs = held(THEIRS, keys=1)._replace(updated_t_ns=np.full(1, NOW_NS + theirs_s * 10**9))
+    ours = held(THEIRS)._replace(updated_t_ns=np.full(1, NOW_NS + ours_s * 10**9))
+    assert hear(one, ours, told(theirs, epoch=5)) == [THEIRS]
+    assert bool(one.claims.owner[0]) is owns
+    assert one.epochs(np.array([THEIRS])).tolist() == [epoch]
+
+
+def test_epochs_have_an_end() -> None:
+    one = unit(OURS)
+    one.inherit(np.array([THEIRS]), np.array([2**32 - 1]))
+    assert one.epochs(np.array([THEIRS])).tolist() == [2**32 - 1]
+
+
 def test_inherited_tracks_are_ours_in_a_later_epoch() -> None:
     one = unit(OURS, owner=True, epoch=4)
     one.inherit(np.array([THEIRS]), np.array([9]))

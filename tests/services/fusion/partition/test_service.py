@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.network.processes import wait_until
+from tests.network.processes import ROOT, wait_until
 from tests.services.fusion.makers import radar
 from tests.services.fusion.running import KEYS, Running
 
@@ -117,15 +117,18 @@ def test_wrong_band_messages_are_refused_by_reason() -> None:
         elsewhere = good.area.model_copy(
             update={"unit_number": 2, "origin": Geodetic(latitude_deg=10.0, longitude_deg=0.0, height_m=0.0)}
         )
+        corners = np.array([[0.0, 0.0], [9e3, 0.0], [1e3, 1e3], [0.0, 9e3]])
+        bent = number["area"].model_copy(update={"polygon_enu_m": corners})
         for payload, kind in [
             (encode(good.model_copy(update=number)), BAND),
             (encode(good.model_copy(update=number)), BAND),
             (encode(good.model_copy(update={"area": elsewhere})), BAND),
             (encode(good.model_copy(update=number | {"unit_id": "someone"})), BAND),
+            (encode(good.model_copy(update={"area": bent, "seq": good.seq + 1})), BAND),
             (b"rubbish", BAND),
         ]:
             west.put(KEYS.band("other"), payload, kind)
-        expected = {"old_frame": 1, "other_origin": 1, "wrong_unit": 1, "malformed": 1}
+        expected = {"old_frame": 1, "other_origin": 1, "wrong_unit": 1, "malformed": 1, "wrong_area": 1}
         wait_until(lambda: expected.items() <= west.refused.items(), "all are refused")
         assert engine_of(west).counters["band_messages"] == 1
 
@@ -148,6 +151,13 @@ def test_settings_that_cannot_work_are_refused_in_one_sentence(change: dict[str,
         FusionSettings.load(None, change)
     assert sentence in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["west", "east"])
+def test_the_examples_can_be_used(name: str) -> None:
+    known = FusionSettings.load(ROOT / "examples" / f"{name}.toml")
+    assert known.unit_id == name and known.partition is not None
+    assert known.band_width_m() == pytest.approx(7563.0, abs=1.0)
 
 
 def test_the_band_is_as_wide_as_the_settings_need() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from trackmesh.protocol.errors import RefusedMessage
 from trackmesh.protocol.messages import BandFrame, Registration, TrackFrame, UnitArea
-from trackmesh.services.fusion.partition.areas import NOWHERE, Area, Place, area_of
+from trackmesh.services.fusion.partition.areas import NOWHERE, Area, Place, area_of, convex
 
 State = Literal["joining", "active", "standby"]
 
@@ -88,7 +88,7 @@ class Neighbours:
         """Take note of a message; its sender, and whether that changes anybody's area.
 
         Raises:
-            RefusedMessage: ``own_band``, ``old_frame``, ``too_many_units`` or ``same_number``.
+            RefusedMessage: ``own_band``, ``old_frame``, ``too_many_units``, ``same_number`` or ``wrong_area``.
         """
         if told.unit_id == self.us.unit_id:
             raise RefusedMessage("own_band", "This is a band message of this unit itself.")
@@ -203,4 +203,9 @@ class Neighbours:
 
 
 def _place(area: UnitArea) -> Place:
+    if area.polygon_enu_m is not None:
+        try:
+            convex(area.polygon_enu_m)
+        except ValueError as error:
+            raise RefusedMessage("wrong_area", f"The area of a neighbour cannot be: {error}.") from None
     return Place(area.centre_enu_m, area.polygon_enu_m)

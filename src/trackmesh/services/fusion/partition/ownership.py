@@ -24,6 +24,7 @@ BoolArray = npt.NDArray[np.bool_]
 NOBODY, UNKNOWN = -1, -2
 """Sources: nobody claims the track; somebody does, but who will be told by a later message."""
 
+_MOST_EPOCH = 2**32 - 1
 GRACE, SILENT, APART = 2, 4, 2
 """Cycles that a track born near a border waits for another's id; without word of its owner; with other plots than it.
 """
@@ -106,7 +107,8 @@ class Ownership:
     def epochs(self, ident: IntArray) -> npt.NDArray[np.uint32]:
         """Epochs (n,) of tracks, 0 of unknown ones."""
         where = index_of(self.claims.ident, ident)
-        return np.where(where >= 0, self.claims.epoch[where] if len(self.claims.ident) else 0, 0).astype(np.uint32)
+        known = self.claims.epoch[where] if len(self.claims.ident) else 0
+        return np.where(where >= 0, np.minimum(known, _MOST_EPOCH), 0).astype(np.uint32)
 
     def known(self, ident: IntArray) -> None:
         """These are all the tracks there are; of new ones nobody knows the owner."""
@@ -223,6 +225,7 @@ class Ownership:
         if now_ns - told.t_ns > self._same_time_ns or not len(rows):
             return
         j = index_of(told.track_id, ident[rows])
+        self._hear_stale(mine, held, told, rows, j, unit)
         apart = np.abs(held.updated_t_ns[rows] - told.updated_t_ns[j]) <= self._same_time_ns
         apart &= (held.keys[rows] != NO_KEY).sum(axis=1) >= NEEDED
         apart &= (told.plot_keys[j] != NO_KEY).sum(axis=1) >= NEEDED
@@ -233,6 +236,24 @@ class Ownership:
         anew = np.zeros(len(ident), np.bool_)
         anew[rows[apart]] = True
         self._rename(mine, ident, anew)
+
+    def _hear_stale(
+        self, mine: Claims, held: Held, told: BandFrame, rows: IntArray, j: IntArray, unit: int
+    ) -> None:  # fmt: skip
+        """Of two owners of one id whose tracks have no plots in common the one that still has plots goes on.
+
+        So it is where a unit was taken for dead for a moment: its neighbour went on with what it cannot see.
+        """
+        both = mine.owner[rows]
+        rows, j = rows[both], j[both]
+        younger_ns = held.updated_t_ns[rows] - told.updated_t_ns[j]
+        epoch = told.epoch[j].astype(np.int64)
+        ours = rows[younger_ns > self._same_time_ns]
+        mine.epoch[ours] = np.maximum(mine.epoch[ours], epoch[younger_ns > self._same_time_ns] + 1)
+        theirs = (younger_ns < -self._same_time_ns) & (epoch > mine.epoch[rows])
+        yields = rows[theirs]
+        mine.owner[yields], mine.source[yields], mine.heard[yields] = False, unit, self.cycle
+        mine.epoch[yields] = epoch[theirs]
 
     def _rename(self, mine: Claims, ident: IntArray, which: BoolArray) -> None:
         """Give tracks ids of their own: another one holds theirs."""

@@ -16,7 +16,7 @@ from trackmesh.services.fusion.sensors import Sensor
 
 _FEWEST_PAIRS = 4
 _TIMES = 4.0
-_SIGMAS, _APART_M, _RANGE_M = 5.0, 50.0, 50_000.0
+_SIGMAS, _APART_M, _RANGE_M, _MOST_M = 5.0, 50.0, 50_000.0, 50_000.0
 
 
 class Priors:
@@ -48,7 +48,8 @@ class Priors:
     def _fits(self, one: SensorBias, sensor: Sensor) -> bool:
         polar = one.columns[0] == "range_m"
         proper = np.isfinite(one.covariance).all() and bias.positive_definite(one.covariance[None]).all()
-        return bool(polar == (sensor.info.kind == "radar") and proper)
+        likely = bias.length(one.bias, polar, _RANGE_M) < _MOST_M
+        return bool(polar == (sensor.info.kind == "radar") and proper and likely)
 
     def _suppose(self, one: SensorBias) -> Change:
         assert self._known is not None
