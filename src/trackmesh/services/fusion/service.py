@@ -139,8 +139,6 @@ class FusionService:
             notices = self._watch.notices(self._alive, time.time_ns())
             sensors = [self._sensor_health(sensor_id) for sensor_id in sorted(self.intake.streams)]
             sensors += self._inputs.health(self.engine.inputs) if self._inputs else []
-        if self._partition is not None:
-            notices = self._partition.of_ours(notices)
         figures |= {f"engine.{name}": float(value) for name, value in counters.items()}
         figures["batches_dropped_here"] = float(self._plots.dropped)
         return Health(figures, sensors, notices)

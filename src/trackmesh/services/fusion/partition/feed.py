@@ -87,14 +87,6 @@ class PartitionFeed:
         if unit != self._unit_id:
             self._runtime.log.info("unit %s %s", unit, "is there" if alive else "is gone")
 
-    def of_ours(self, notices: dict[str, str]) -> dict[str, str]:
-        """Notices but those of sensors whose plots are not needed here: these are silent for us alone."""
-        ours = self.plots.sensors
-        about = {name: name.split(" ", 1) for name in notices}
-        return {
-            n: text for n, text in notices.items() if about[n][0] not in ("silent", "refused") or about[n][1] in ours
-        }
-
     def exchange(self, engine: FusionEngine) -> None:
         """Everything that has come since the last call goes to the engine, what the engine has to say goes out."""
         assert isinstance(engine, PartitionedEngine)
