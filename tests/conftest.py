@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pytest
 
-LAST = ("tests/services/estimation/", "tests/sim/studies/")
+LAST = ("tests/services/fusion/partition/", "tests/services/estimation/", "tests/sim/studies/")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -21,7 +21,7 @@ M = TypeVar("M", bound=Message)
 
 Tracks = Annotated[Path, typer.Argument(metavar="TRACKS.jsonl", help="As written by track, or watch --out.")]
 
-convert = typer.Typer(help="Turn a recording in another format into PLOTS.jsonl or SCANS.jsonl.", no_args_is_help=True)
+convert = typer.Typer(help="Turn recordings of other formats into ours.", no_args_is_help=True)
 
 
 def records_of(path: Path, kind: type[M]) -> Iterator[M]:

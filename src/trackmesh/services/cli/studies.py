@@ -41,7 +41,7 @@ def study(
     plots: Annotated[Path | None, typer.Option("--plots", help="Write the figures to this folder.")] = None,
     runs: Annotated[int, typer.Option("--runs", min=0, help="Monte-Carlo runs; 0: as many as the study needs.")] = 0,
 ) -> None:
-    """Compute a paper's tables anew and set them beside the printed ones."""
+    """Compute a paper's tables anew, beside the printed."""
     known = _studies()
     if name not in known:
         raise TrackmeshError(f"There is no study {name!r}; there are {', '.join(known)}.")
