@@ -23,6 +23,7 @@ from benchmarks.faults.chaos import TARGETS, write_scenario
 from benchmarks.faults.deployment import Deployment, free_port, trackmesh, wait_ready
 from benchmarks.faults.flooder import SECTORS, batch, broken
 from benchmarks.live import Recorder, latencies_ms
+from trackmesh.protocol.bus import Sample
 from trackmesh.protocol.client import Client
 from trackmesh.protocol.codec import decode, encode, encoding
 from trackmesh.protocol.errors import RefusedMessage
@@ -82,7 +83,7 @@ class Flood:
                 wait_ready(Client(bus))
                 given = ["--scenario", str(path), "--radar", RADAR, "--connect", self.endpoint]
                 self.parts.add(RADAR, lambda _: trackmesh("sim", "radar", *given))
-                time.sleep(3 * SETTLE_S)
+                time.sleep(2 * SETTLE_S)
                 phases = {
                     "alone": self._phase(bus, 0.0, "plots"),
                     "beside a sensor at its rate": self._phase(bus, SECTORS, "plots"),
@@ -118,10 +119,16 @@ class Flood:
         refused = Counter(after.refused) - Counter(before.refused)
         return {
             "p50_ms": float(p50), "p99_ms": float(p99), "max_ms": float(found.max()), "plots": len(found),
-            "refused": dict(refused),
+            "frames_missed": _missed([s for _, s in frames.samples]), "refused": dict(refused),
             "quiet_missing": quiet.gaps, "quiet_refused": quiet.refused,
             "tracks": after.figures.get("tracks", 0.0), "frames_a_second": len(frames.samples) / self.seconds,
         }  # fmt: skip
+
+
+def _missed(samples: list[Sample]) -> int:
+    """Frames that a subscription without history did not get."""
+    numbers = [decode(s.payload, TrackFrame, s.encoding).seq for s in samples]
+    return numbers[-1] - numbers[0] + 1 - len(numbers) if numbers else 0
 
 
 def _status(bus: ZenohBus) -> ServiceStatus:

@@ -84,7 +84,8 @@ class Soak:
 
     def _follow(self, bus: ZenohBus, endpoint: str) -> None:
         keys, client = Keys(), Client(bus)
-        frames = bus.subscribe(keys.tracks("*"), capacity=10_000)
+        # As clients do: what the network dropped is fetched.
+        frames = bus.subscribe(keys.tracks("*"), history=True, capacity=10_000)
         plots = bus.subscribe(keys.plots("*"), capacity=10_000)
         statuses = client.watch_statuses("fusion")
         begin_s = time.monotonic()
