@@ -20,6 +20,10 @@ _HEAD = """\
 """
 
 
+# As our own processes set it: see protocol/zenoh_config.py.
+_QUEUE = {"size": {"data_high": 16}, "congestion_control": {"block": {"wait_before_close": 500_000}}}
+
+
 def router_file(plan: Plan, name: str | None = None, *, password: str | None = None) -> str:
     """The JSON5 text for a router of a deployment.
 
@@ -46,7 +50,7 @@ def router_settings(plan: Plan, name: str, router: RouterPlan, password: str | N
             # A site goes on without the other one, and finds it when it is back.
             "exit_on_failure": False,
             "timeout_ms": -1,
-            "retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+            "retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         },
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": True},
@@ -67,7 +71,7 @@ def router_settings(plan: Plan, name: str, router: RouterPlan, password: str | N
 
 def _link(plan: Plan, name: str) -> dict[str, object]:
     link: dict[str, object] = {
-        "tx": {"lease": 2000, "queue": {"congestion_control": {"block": {"wait_before_close": 500_000}}}},
+        "tx": {"lease": 2000, "queue": _QUEUE},
         "rx": {"max_message_size": MAX_BYTES + 2**20},
     }
     if any(endpoint.startswith(("tls/", "quic/")) for r in plan.routers.values() for endpoint in r.listen + r.connect):
