@@ -23,7 +23,7 @@ _SHARED: dict[str, object] = {
     # for good: connected, alive, and never heard again.
     "transport/link/tx/lease": 2000,
     "transport/link/tx/queue/congestion_control/block/wait_before_close": 500_000,
-    # A busy machine needs longer than a millisecond to send on; with the default of 2 batches frames were dropped then.
+    # What finds no place for a millisecond is dropped. A precaution for busy machines: the default is 2 batches.
     "transport/link/tx/queue/size/data_high": 16,
     # Else a router that accepts but never answers holds an opening client for 10 s.
     "transport/unicast/open_timeout": 2000,
