@@ -10,13 +10,18 @@ MINUTES ?= 20
 demo: $(VENV)/ready
 	$(BIN)/trackmesh demo --seconds $(SECONDS_)
 
+# Tests of real processes wait more than they work: these beside the rest of tests/network.
+BESIDE := tests/hosts $(wildcard tests/network/test_units_*.py) tests/network/test_live_benchmark.py tests/network/test_tags_live.py
+
 # Most of a first run is compilation: two halves at once, then the real processes on a machine that is quiet again.
 test: check
 	mkdir -p out
 	$(BIN)/python -m pytest tests/services/fusion tests/services/cli > out/tests-fusion.txt 2>&1 & half=$$!; \
 		$(BIN)/python -m pytest tests --ignore=tests/services/fusion --ignore=tests/services/cli --ignore=tests/network --ignore=tests/hosts; \
 		rest=$$?; wait $$half; half=$$?; cat out/tests-fusion.txt; exit $$((rest | half))
-	$(BIN)/python -m pytest tests/network tests/hosts
+	$(BIN)/python -m pytest $(BESIDE) > out/tests-beside.txt 2>&1 & half=$$!; \
+		$(BIN)/python -m pytest tests/network $(addprefix --ignore=,$(BESIDE)); \
+		rest=$$?; wait $$half; half=$$?; cat out/tests-beside.txt; exit $$((rest | half))
 
 check: $(VENV)/ready
 	$(BIN)/ruff check src tests benchmarks
