@@ -125,7 +125,8 @@ def test_a_killed_units_tracks_go_on_under_their_ids(
         # A track that only coasts is none that goes on.
         kept = np.isin(dead.track_id, heir.track_id[heir.status == CONFIRMED])
         print(f"{kept.sum()} of {len(kept)} ids kept after {AFTER_S:g} s, at least {least} of {TARGETS} shown")
-        assert kept.mean() >= 0.96
+        # All but one of 23: a track may coast at the very moment at which it is looked at.
+        assert (~kept).sum() <= 1
         # They are on the same targets: all fly straight on.
         order = np.argsort(heir.track_id)
         place = order[np.searchsorted(heir.track_id[order], dead.track_id[kept])]
